@@ -1,0 +1,210 @@
+"""Bodies: square masses, soft springs between them, and chambers that hold gas.
+
+A ring (the paper's agent) is one body among others: springs and chambers are lists of mass indices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from turgor.errors import InvalidInput, describe
+
+GAS_CONSTANT = 8.314462618  # J/(mol K), exact since 2019
+MINIMUM_MASSES = 3
+
+
+class Body(msgspec.Struct, frozen=True, eq=False, kw_only=False):
+    """A soft body at rest: what it is made of, not where it stands.
+
+    Every per-element field takes one number or one number per element, and is stored per element.
+    Raises `InvalidInput` for a body that cannot exist (too few masses, a spring to nowhere, ...).
+    """
+
+    position: Any  # [m], shape [mass, 2], relative to the body's own origin
+    angle: Any = 0.0  # [rad], shape [mass]; a mass never turns from it
+    springs: Any = ()  # [1], shape [spring, 2], indices of the two masses; solved from the last to the first
+    chambers: Any = ()  # closed loops of mass indices, counter-clockwise around their gas
+    gas_amount: Any = 0.0  # [mol], shape [chamber]
+    side: Any = 1.0  # [m], shape [mass]
+    density: Any = 2500.0  # [kg/m^2], shape [mass]
+    friction: float = 10.0  # [1], mixed with the other surface's by the geometric mean
+    rest_length: Any = None  # [m], shape [spring]; None: the distances in `position`
+    frequency: Any = 8.0  # [Hz], shape [spring]
+    damping_ratio: Any = 0.3  # [1], shape [spring]
+    shortest: Any = 0.75  # [1], shape [spring], shortest commanded length / rest length
+    longest: Any = 1.25  # [1], shape [spring], longest commanded length / rest length
+
+    def __post_init__(self) -> None:
+        put = msgspec.structs.force_setattr
+        position = _array("position", self.position, (None, 2))
+        count = len(position)
+        springs = _indices("springs", self.springs, count)
+        chambers = _loops(self.chambers, count)
+        put(self, "position", position)
+        put(self, "springs", springs)
+        put(self, "chambers", chambers)
+        put(self, "angle", _per("angle", self.angle, count))
+        put(self, "side", _positive("side", _per("side", self.side, count)))
+        put(self, "density", _positive("density", _per("density", self.density, count)))
+        put(self, "gas_amount", _per("gas_amount", self.gas_amount, len(chambers)))
+        put(self, "friction", float(self.friction))
+        if (self.gas_amount < 0).any():
+            raise InvalidInput("gas_amount: expected 0 mol or more", describe(self.gas_amount.min()))
+        if not (math.isfinite(self.friction) and self.friction >= 0):
+            raise InvalidInput("friction: expected a finite number, 0 or more", describe(self.friction))
+        distance = np.linalg.norm(position[springs[:, 1]] - position[springs[:, 0]], axis=1)
+        rest = distance if self.rest_length is None else _per("rest_length", self.rest_length, len(springs))
+        put(self, "rest_length", _frozen(_positive("rest_length", rest)))
+        for name in ("frequency", "damping_ratio", "shortest", "longest"):
+            values = _per(name, getattr(self, name), len(springs))
+            put(self, name, values if name == "damping_ratio" else _positive(name, values))
+        if (self.damping_ratio < 0).any():
+            raise InvalidInput("damping_ratio: expected 0 or more", describe(self.damping_ratio.min()))
+        if (self.shortest > 1).any() or (self.longest < 1).any():
+            raise InvalidInput(
+                "shortest, longest: expected shortest <= 1 <= longest",
+                f"{describe(self.shortest.max())} and {describe(self.longest.min())}",
+            )
+
+    @property
+    def mass_count(self) -> int:
+        return len(self.position)
+
+    @property
+    def spring_count(self) -> int:
+        return len(self.springs)
+
+    @property
+    def chamber_count(self) -> int:
+        return len(self.chambers)
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Mass of each square [kg], shape [mass]."""
+        return self.density * self.side**2
+
+    @property
+    def radius(self) -> float:
+        """Mean distance of the masses from their centroid [m]; a ring's radius."""
+        return float(np.linalg.norm(self.position - self.position.mean(axis=0), axis=1).mean())
+
+    def chamber_radius(self, chamber: int) -> float:
+        """Mean distance of a chamber's masses from their centroid [m]; pi times its square is the area
+        that p_max and the area ratio refer to."""
+        corner = self.position[list(self.chambers[chamber])]
+        return float(np.linalg.norm(corner - corner.mean(axis=0), axis=1).mean())
+
+    def area(self, position: np.ndarray) -> np.ndarray:
+        """Signed (shoelace) area of each chamber [m^2], shape [..., chamber], for `position` [..., mass, 2]."""
+        areas = []
+        for loop in self.chambers:
+            here = position[..., list(loop), :]
+            following = np.roll(here, -1, axis=-2)
+            cross = here[..., 0] * following[..., 1] - following[..., 0] * here[..., 1]
+            areas.append(0.5 * cross.sum(axis=-1))
+        return np.stack(areas, axis=-1) if areas else np.zeros((*position.shape[:-2], 0))
+
+    def lowest_corner(self) -> float:
+        """Lowest y of any square's corner [m] when the body stands at its own origin."""
+        reach = 0.5 * self.side * (np.abs(np.cos(self.angle)) + np.abs(np.sin(self.angle)))
+        return float((self.position[:, 1] - reach).min())
+
+
+def ring(
+    mass_count: int,
+    radius: float,
+    *,
+    gas_amount: float = 0.0,
+    **elements: Any,
+) -> Body:
+    """A `Body` like the paper's: masses on a circle, joined in a closed ring around one chamber of gas.
+
+    Mass i stands at the angle 2 pi i / n, counter-clockwise, the first at (+radius, 0), turned by that angle;
+    spring i joins masses i and i + 1. `gas_amount` in mol, `radius` in m; `elements` are the other fields
+    of `Body`. Source: Pigozzi 2022, and its program for the turned squares.
+    """
+    if not isinstance(mass_count, int | np.integer) or mass_count < MINIMUM_MASSES:
+        raise InvalidInput(f"mass_count: expected a whole number, at least {MINIMUM_MASSES}", describe(mass_count))
+    if not (isinstance(radius, int | float | np.number) and math.isfinite(radius) and radius > 0):
+        raise InvalidInput("radius: expected a positive number of metres", describe(radius))
+    index = np.arange(mass_count)
+    angle = 2 * np.pi * index / mass_count
+    return Body(
+        position=radius * np.stack([np.cos(angle), np.sin(angle)], axis=1),
+        angle=angle,
+        springs=np.stack([index, (index + 1) % mass_count], axis=1),
+        chambers=[index.tolist()],
+        gas_amount=gas_amount,
+        # the chord from its formula: the distances of rounded positions differ in the last bits
+        rest_length=2 * radius * math.sin(math.pi / mass_count),
+        **elements,
+    )
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array = np.array(array)
+    array.flags.writeable = False
+    return array
+
+
+def _array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InvalidInput(f"{name}: expected numbers", describe(value)) from None
+    if array.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, array.shape, strict=True)):
+        raise InvalidInput(f"{name}: expected shape {_shape(shape)}", f"shape {_shape(array.shape)}")
+    if not np.isfinite(array).all():
+        raise InvalidInput(f"{name}: expected finite numbers", "NaN or infinity")
+    return _frozen(array)
+
+
+def _shape(shape: Sequence[int | None]) -> str:
+    return "[" + ", ".join("any" if n is None else str(n) for n in shape) + "]"
+
+
+def _per(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    if np.ndim(value) == 0:
+        value = np.full(count, value)
+    return _array(name, value, (count,))
+
+
+def _positive(name: str, array: np.ndarray) -> np.ndarray:
+    if (array <= 0).any():
+        raise InvalidInput(f"{name}: expected positive numbers", describe(array.min()))
+    return array
+
+
+def _indices(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    array = _array(name, np.reshape(np.asarray(value, dtype=np.float64), (-1, 2)), (None, 2)).astype(np.int64)
+    if array.size and (array.min() < 0 or array.max() >= count or (array[:, 0] == array[:, 1]).any()):
+        raise InvalidInput(f"{name}: expected pairs of different masses, 0 to {count - 1}", describe(array.tolist()))
+    return _frozen(array)
+
+
+def _loops(value: Sequence[Sequence[int]], count: int) -> tuple[tuple[int, ...], ...]:
+    loops = tuple(tuple(int(i) for i in loop) for loop in value)
+    for loop in loops:
+        if len(loop) < MINIMUM_MASSES or len(set(loop)) != len(loop) or min(loop) < 0 or max(loop) >= count:
+            raise InvalidInput(
+                f"chambers: expected loops of 3 or more different masses, 0 to {count - 1}", describe(loop)
+            )
+    return loops
+
+
+# The amounts of gas are those that the paper's program computed (grams times molar mass); the printed 0.05 to
+# 0.1 kg never lift the body. See docs/replication.md.
+SIZES = {
+    "small": {"mass_count": 10, "radius": 5.0, "gas_amount": 1400.67},
+    "medium": {"mass_count": 15, "radius": 7.5, "gas_amount": 2101.005},
+    "large": {"mass_count": 20, "radius": 10.0, "gas_amount": 2801.34},
+}
+SMALL = ring(**SIZES["small"])
+MEDIUM = ring(**SIZES["medium"])
+LARGE = ring(**SIZES["large"])

@@ -1,0 +1,22 @@
+"""The errors that a user can cause, told in one line: what was expected, what came."""
+
+from __future__ import annotations
+
+
+class InvalidInput(ValueError):
+    """Something from outside is not what was expected."""
+
+    def __init__(self, expected: str, got: str | None = None) -> None:
+        super().__init__(expected if got is None else f"{expected}; got {got}")
+
+
+def describe(value: object) -> str:
+    """A short, one-line form of `value` for an error message."""
+    text = " ".join(str(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def one_of(name: str, names: object, got: object) -> InvalidInput:
+    """The error for a `name` that is not one of `names`."""
+    choices = ", ".join(str(n) for n in names)  # ty: ignore[not-iterable]
+    return InvalidInput(f"{name}: expected one of {choices}", repr(got))

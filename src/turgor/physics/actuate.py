@@ -1,0 +1,77 @@
+"""Control and actuation: commands from the controller, rest lengths and pressures from commands."""
+
+from turgor.physics.lanes import fill, inlined, select, stage
+from turgor.physics.model import CONTROLLED
+from turgor.physics.sense import clamp
+
+
+@inlined
+def tanh(x):
+    """tanh x within 3e-7 as x P(x^2) / Q(x^2), own minimax fit on |x| <= 8: the same bits on every processor."""
+    x = clamp(x, -8.0, 8.0)
+    q = x * x
+    p = (((1.523027253483476e-08 * q + 2.189456319918891e-05) * q + 3.5715922168691695e-03) * q
+         + 1.344449314300786e-01) * q + 0.9999999935761286  # fmt: skip
+    d = (((8.522389122752359e-07 * q + 3.4112823940001094e-04) * q + 2.6164421009586915e-02) * q
+         + 4.677782046366341e-01) * q + 1.0  # fmt: skip
+    return x * p / d
+
+
+@stage
+def control(settings, brain, work):
+    """command = tanh(W_s o + b_s) for springs, W_p o + b_p for chambers."""
+    inputs = settings.inputs
+    whole = inputs - inputs % 4
+    for j in range(settings.outputs):
+        at = j * inputs
+        # four sums hide the latency of the additions; their order is fixed
+        a = brain.bias[j]
+        b = fill(work.mean, 0.0)
+        c = b
+        d = b
+        for k in range(0, whole, 4):
+            a += brain.weight[at + k] * work.mean[k]
+            b += brain.weight[at + k + 1] * work.mean[k + 1]
+            c += brain.weight[at + k + 2] * work.mean[k + 2]
+            d += brain.weight[at + k + 3] * work.mean[k + 3]
+        for k in range(whole, inputs):
+            a += brain.weight[at + k] * work.mean[k]
+        output = (a + b) + (c + d)
+        if j < settings.springs:
+            output = tanh(output)
+        work.command[j] = output
+
+
+@stage
+def actuate(settings, model, state, work):
+    """rest = L0 - s (L0 - l_min) for s > 0, L0 - s (l_max - L0) for s < 0;  p = clip(p + p_unit dp)."""
+    if settings.outputs > 0:
+        for j in range(settings.springs):
+            s = work.command[j]
+            state.rest[j] = model.rest[j] - s * select(
+                s > 0.0, fill(state.rest, model.shortening[j]), model.lengthening[j]
+            )
+    if settings.pressure_source == CONTROLLED:
+        for c in range(settings.chambers):
+            change = model.pressure_step[c] * work.command[settings.springs + c]
+            state.pressure[c] = clamp(state.pressure[c] + change, model.pressure_min[c], model.pressure_max[c])
+
+
+@stage
+def take_commands(settings, work, script, row):
+    """Commands from outside instead of the controller's; springs within [-1, 1]."""
+    for j in range(settings.outputs):
+        command = script.row[row * settings.outputs + j]
+        if j < settings.springs:
+            command = clamp(command, -1.0, 1.0)
+        work.command[j] = command
+
+
+@stage
+def take_lengths(settings, state, script, row):
+    """Rest lengths and pressures from outside."""
+    at = row * (settings.springs + settings.chambers)
+    for j in range(settings.springs):
+        state.rest[j] = script.row[at + j]
+    for c in range(settings.chambers):
+        state.pressure[c] = script.row[at + settings.springs + c]

@@ -1,0 +1,266 @@
+"""Contacts: which masses touch the scene or each other, in one fixed order.
+
+Masses in turn, each with the segments of its column in the order of the scene; then pairs (a, b) in the order of
+the model. A contact that any lane of the block has is in the list; in the other lanes its normal is 0, so that it
+does nothing there. Thus an agent's contacts are solved in the same order, whatever its neighbours do.
+"""
+
+from turgor.physics.lanes import any_lane, fill, inlined, lane_bits, lowest_bit, rare, select, stage
+from turgor.physics.manifold import NO_ID, NO_POINT, kept, segment_on_face, square_on_segment, square_on_square
+from turgor.physics.model import MARGIN, NOWHERE
+
+FAR_BELOW = -1e9  # [m], where the segment of an empty slot lies
+
+
+@stage
+def find_ground_contacts(settings, model, state, work):
+    """Lists the contacts with the scene and returns their number; renews `touch`."""
+    count = 0
+    for i in range(settings.masses):
+        state.touch[i] = fill(state.x, 0.0)
+        x = state.x[i]
+        moved = (x < state.left[i]) | (x >= state.right[i])
+        if any_lane(moved):
+            enter_columns(settings, model, state, work, i, lane_bits(moved))
+        y = state.y[i]
+        first = i * settings.slots
+        if any_lane((y < state.floor[i]) | (y > state.ceiling[i])):
+            for slot in range(first, first + state.used[i]):
+                count = add_ground_contact(settings, model, state, work, i, slot, count)
+        else:
+            for slot in range(first, first + state.used[i]):
+                state.ground_live[slot] = 0
+    return count
+
+
+@inlined
+def add_ground_contact(settings, model, state, work, i, slot, count):
+    """Lists the contact of mass i with the segment in `slot`, if any lane has it; returns the new count."""
+    x = state.x[i]
+    y = state.y[i]
+    nx = state.nx[slot]
+    ny = state.ny[slot]
+    depth = state.depth[slot]
+    px = state.px[slot] - x
+    py = state.py[slot] - y
+    above = -(nx * px + ny * py)
+    if not any_lane((above <= model.half[i] * 1.4143 + settings.reach) & (above >= -depth)):
+        state.ground_live[slot] = 0
+        return count
+
+    half = model.half[i]
+    qx = state.qx[slot] - x
+    qy = state.qy[slot] - y
+    touches, behind, face, gap_segment, gap_face, u1, w1, u2, w2, gap_a, id_a, gap_b, id_b = square_on_segment(
+        settings, half, model.cosine[i], model.sine[i], nx, ny, depth, px, py, qx, qy
+    )
+    on_face = touches & ~behind & (gap_face > 0.98 * gap_segment + 0.001)
+    if any_lane(on_face):
+        face_a, face_id_a, face_b, face_id_b, left = segment_on_face(half, face, u1, w1, u2, w2)
+        touches = touches & (left | ~on_face)
+        gap_a = select(on_face, face_a, gap_a)
+        id_a = select(on_face, face_id_a, id_a)
+        gap_b = select(on_face, face_b, gap_b)
+        id_b = select(on_face, face_id_b, id_b)
+        # the normal is that of the square's face, towards the square
+        c = fill(state.x, model.cosine[i])
+        s = fill(state.x, model.sine[i])
+        nx = select(on_face, -select(face == 0.0, s, select(face == 1.0, c, select(face == 2.0, -s, -c))), nx)
+        ny = select(on_face, -select(face == 0.0, -c, select(face == 1.0, s, select(face == 2.0, c, -s))), ny)
+    touches, gap0, id0, gap1, id1 = kept(settings.reach, touches, gap_a, id_a, gap_b, id_b)
+    if not any_lane(touches):
+        state.ground_live[slot] = 0
+        return count
+
+    state.touch[i] = select(touches, 1.0, state.touch[i])
+    work.ground_mass[count] = i
+    work.ground_slot[count] = slot
+    work.ground_nx[count] = select(touches, nx, 0.0)
+    work.ground_ny[count] = select(touches, ny, 0.0)
+    work.ground_gap0[count] = gap0 - settings.reach
+    work.ground_gap1[count] = gap1 - settings.reach
+    if state.ground_live[slot] == 0:
+        state.ground_live[slot] = 1
+        forget(state.ground_id0, state.ground_id1, slot)
+    old0 = state.ground_id0[slot]
+    old1 = state.ground_id1[slot]
+    n0 = state.ground_normal0[slot]
+    t0 = state.ground_tangent0[slot]
+    n1 = state.ground_normal1[slot]
+    t1 = state.ground_tangent1[slot]
+    work.ground_normal[count] = recall(id0, old0, n0, old1, n1)
+    work.ground_tangent[count] = recall(id0, old0, t0, old1, t1)
+    state.ground_normal1[slot] = recall(id1, old0, n0, old1, n1)
+    state.ground_tangent1[slot] = recall(id1, old0, t0, old1, t1)
+    state.ground_id0[slot] = id0
+    state.ground_id1[slot] = id1
+    return count + 1
+
+
+@inlined
+def forget(id0, id1, at):
+    """No lane has an impulse to recall."""
+    id0[at] = fill(id0, NO_ID)
+    id1[at] = fill(id1, NO_ID)
+
+
+@inlined
+def recall(new, old0, impulse0, old1, impulse1):
+    """The impulse that the point `new` had in the step before, 0 if it was not there."""
+    known = new != NO_ID
+    return select(known & (new == old0), impulse0, select(known & (new == old1), impulse1, 0.0))
+
+
+@rare
+def enter_columns(settings, model, state, work, i, lanes):
+    """Copies the column that mass i is in to each of `lanes` (bits), and takes along the impulses of the segments
+    that the old column had too."""
+    reach = model.extent[i] + settings.reach + MARGIN
+    slots = settings.slots
+    first = i * slots
+    while lanes != 0:
+        lane = lowest_bit(lanes)
+        lanes = lanes & (lanes - 1)
+        cell = find_column(settings, model, state.x[i, lane])
+        state.left[i, lane] = model.column[cell]
+        state.right[i, lane] = model.column[cell + 1]
+        state.floor[i, lane] = model.floor[cell] + reach
+        state.ceiling[i, lane] = model.ceiling[cell] - reach
+        state.listed[i, lane] = model.listed[cell]
+        carry_impulses(settings, state, work, first, lane)
+        for k in range(slots):
+            fill_slot(settings, model, state, work, first, k, lane, model.candidate[cell * slots + k])
+    used = 0
+    for lane in range(settings.lanes):
+        used = max(used, state.listed[i, lane])
+    for slot in range(first + used, first + slots):
+        state.ground_live[slot] = 0
+    state.used[i] = used
+
+
+@inlined
+def find_column(settings, model, x):
+    """The column that holds x."""
+    low = 0
+    high = settings.columns
+    while high - low > 1:
+        middle = (low + high) // 2
+        if x >= model.column[middle]:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@inlined
+def carry_impulses(settings, state, work, first, lane):
+    """Sets the impulses of a lane's old column aside."""
+    for k in range(settings.slots):
+        slot = first + k
+        work.carried_segment[k] = state.segment[slot, lane]
+        work.carried_id0[k] = NO_ID
+        work.carried_id1[k] = NO_ID
+        if state.ground_live[slot] != 0:
+            work.carried_id0[k] = state.ground_id0[slot, lane]
+            work.carried_id1[k] = state.ground_id1[slot, lane]
+            work.carried_normal0[k] = state.ground_normal0[slot, lane]
+            work.carried_tangent0[k] = state.ground_tangent0[slot, lane]
+            work.carried_normal1[k] = state.ground_normal1[slot, lane]
+            work.carried_tangent1[k] = state.ground_tangent1[slot, lane]
+
+
+@inlined
+def fill_slot(settings, model, state, work, first, k, lane, segment):
+    """Puts a segment into slot k of a lane, with the impulses that were set aside for it."""
+    slot = first + k
+    state.segment[slot, lane] = segment
+    if segment == NOWHERE:
+        state.px[slot, lane] = 0.0
+        state.py[slot, lane] = FAR_BELOW
+        state.nx[slot, lane] = 0.0
+        state.ny[slot, lane] = 1.0
+        state.depth[slot, lane] = 0.0
+    else:
+        state.px[slot, lane] = model.x1[segment]
+        state.py[slot, lane] = model.y1[segment]
+        state.qx[slot, lane] = model.x2[segment]
+        state.qy[slot, lane] = model.y2[segment]
+        state.nx[slot, lane] = model.nx[segment]
+        state.ny[slot, lane] = model.ny[segment]
+        state.depth[slot, lane] = model.depth[segment]
+    if state.ground_live[slot] != 0:
+        state.ground_id0[slot, lane] = NO_ID
+        state.ground_id1[slot, lane] = NO_ID
+    for old in range(settings.slots):
+        if segment != NOWHERE and work.carried_segment[old] == segment and work.carried_id0[old] != NO_ID:
+            if state.ground_live[slot] == 0:
+                state.ground_live[slot] = 1
+                for other in range(settings.lanes):
+                    state.ground_id0[slot, other] = NO_ID
+                    state.ground_id1[slot, other] = NO_ID
+            state.ground_id0[slot, lane] = work.carried_id0[old]
+            state.ground_id1[slot, lane] = work.carried_id1[old]
+            state.ground_normal0[slot, lane] = work.carried_normal0[old]
+            state.ground_tangent0[slot, lane] = work.carried_tangent0[old]
+            state.ground_normal1[slot, lane] = work.carried_normal1[old]
+            state.ground_tangent1[slot, lane] = work.carried_tangent1[old]
+
+
+@stage
+def find_pair_contacts(settings, model, state, work):
+    """Lists the contacts of two masses and returns their number; renews `touch`."""
+    count = 0
+    for p in range(settings.pairs):
+        a = model.pair_a[p]
+        b = model.pair_b[p]
+        dx = state.x[b] - state.x[a]
+        dy = state.y[b] - state.y[a]
+        if any_lane(max(abs(dx), abs(dy)) < model.pair_reach[p]):
+            count = add_pair_contact(settings, model, state, work, p, a, b, dx, dy, count)
+        elif state.pair_live[p] != 0:
+            state.pair_live[p] = 0
+    return count
+
+
+@inlined
+def add_pair_contact(settings, model, state, work, p, a, b, dx, dy, count):
+    """Lists the contact of pair p, if any lane has it; returns the new count."""
+    touches, nx, ny, gap0, id0, gap1, id1 = square_on_square(
+        settings.reach,
+        model.half[a],
+        model.half[b],
+        model.cosine[a],
+        model.sine[a],
+        model.cosine[b],
+        model.sine[b],
+        model.pair_cosine[p],
+        model.pair_sine[p],
+        dx,
+        dy,
+    )
+    if not any_lane(touches):
+        state.pair_live[p] = 0
+        return count
+    state.touch[a] = select(touches, 1.0, state.touch[a])
+    state.touch[b] = select(touches, 1.0, state.touch[b])
+    work.pair[count] = p
+    work.pair_nx[count] = select(touches, nx, 0.0)
+    work.pair_ny[count] = select(touches, ny, 0.0)
+    work.pair_gap0[count] = gap0 - settings.reach
+    work.pair_gap1[count] = gap1 - settings.reach
+    if state.pair_live[p] == 0:
+        state.pair_live[p] = 1
+        forget(state.pair_id0, state.pair_id1, p)
+    old0 = state.pair_id0[p]
+    old1 = state.pair_id1[p]
+    n0 = state.pair_normal0[p]
+    t0 = state.pair_tangent0[p]
+    n1 = state.pair_normal1[p]
+    t1 = state.pair_tangent1[p]
+    work.pair_normal[count] = recall(id0, old0, n0, old1, n1)
+    work.pair_tangent[count] = recall(id0, old0, t0, old1, t1)
+    state.pair_normal1[p] = recall(id1, old0, n0, old1, n1)
+    state.pair_tangent1[p] = recall(id1, old0, t0, old1, t1)
+    state.pair_id0[p] = id0
+    state.pair_id1[p] = id1
+    return count + 1
