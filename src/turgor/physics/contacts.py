@@ -25,7 +25,7 @@ def find_ground_contacts(settings, model, state, work):
         y = state.y[i]
         first = i * settings.slots
         if any_lane((y < state.floor[i]) | (y > state.ceiling[i])):
-            for slot in range(first, first + state.used[i]):
+            for slot in range(first + state.used[i] - 1, first - 1, -1):
                 count = add_ground_contact(settings, model, state, work, i, slot, count)
         else:
             for slot in range(first, first + state.used[i]):
@@ -51,10 +51,9 @@ def add_ground_contact(settings, model, state, work, i, slot, count):
     half = model.half[i]
     qx = state.qx[slot] - x
     qy = state.qy[slot] - y
-    touches, behind, face, gap_segment, gap_face, u1, w1, u2, w2, gap_a, id_a, gap_b, id_b = square_on_segment(
+    touches, on_face, face, u1, w1, u2, w2, gap_a, id_a, gap_b, id_b = square_on_segment(
         settings, half, model.cosine[i], model.sine[i], nx, ny, depth, px, py, qx, qy
     )
-    on_face = touches & ~behind & (gap_face > 0.98 * gap_segment + 0.001)
     if any_lane(on_face):
         face_a, face_id_a, face_b, face_id_b, left = segment_on_face(half, face, u1, w1, u2, w2)
         touches = touches & (left | ~on_face)

@@ -69,8 +69,8 @@ def clip(gap0, eta0, id0, gap1, eta1, id1, low, high):
 @inlined
 def square_on_segment(settings, half, cosine, sine, nx, ny, depth, q1x, q1y, q2x, q2y):
     """Contact of a square with a segment whose ends are seen from the square's centre at q1 and q2 [m]: whether it
-    touches and whether from behind; its nearest face, the gaps of segment and face as the reference, the segment's
-    ends in the square's axes; the two points with the segment as the reference."""
+    touches, and whether its nearest `face` is the reference, not the segment; the face and the segment's ends in the
+    square's axes, for `segment_on_face`; the two points with the segment as the reference."""
     reach = settings.reach
     above = -(nx * q1x + ny * q1y)  # the centre's height over the segment's line
     na = nx * cosine + ny * sine
@@ -108,8 +108,9 @@ def square_on_segment(settings, half, cosine, sine, nx, ny, depth, q1x, q1y, q2x
     gap_b = select(behind, gap1, gap_b)
     id_a = select(behind, id0, id_a)
     id_b = select(behind, id1, id_b)
-    touches = touches & (left | behind)
-    return touches, behind, face, gap_segment, gap_face, u1, w1, u2, w2, gap_a, id_a, gap_b, id_b
+    on_face = touches & ~behind & (gap_face > 0.98 * gap_segment + 0.001)
+    touches = touches & (left | behind | on_face)
+    return touches, on_face, face, u1, w1, u2, w2, gap_a, id_a, gap_b, id_b
 
 
 @inlined

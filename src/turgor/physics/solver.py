@@ -42,8 +42,8 @@ def solve_velocities(settings, model, state, work, grounds, pairs):
     """The velocity iterations; the impulses are kept for the next step's warm start."""
     for _ in range(settings.velocity_iterations):
         solve_springs(settings, model, state, work)
-        solve_grounds(settings, state, work, grounds)
         solve_pairs(settings, model, state, work, pairs)
+        solve_grounds(settings, state, work, grounds)
     for c in range(grounds):
         state.ground_normal0[work.ground_slot[c]] = work.ground_normal[c]
         state.ground_tangent0[work.ground_slot[c]] = work.ground_tangent[c]
@@ -122,6 +122,10 @@ def correct_positions(settings, model, state, work, grounds, pairs):
     busy = fill(state.x, 0.0) == 0.0
     for _ in range(settings.position_iterations):
         deepest = fill(state.x, 0.0)
+        for c in range(pairs):
+            p = work.pair[c]
+            deepest = min(deepest, correct_pair(settings, model, work, c, p, work.pair_gap0[c], busy))
+            deepest = min(deepest, correct_pair(settings, model, work, c, p, work.pair_gap1[c], busy))
         for c in range(grounds):
             i = work.ground_mass[c]
             nx = work.ground_nx[c]
@@ -138,10 +142,6 @@ def correct_positions(settings, model, state, work, grounds, pairs):
             push = correction(settings, gap, busy)
             work.dx[i] = dx - push * nx
             work.dy[i] = dy - push * ny
-        for c in range(pairs):
-            p = work.pair[c]
-            deepest = min(deepest, correct_pair(settings, model, work, c, p, work.pair_gap0[c], busy))
-            deepest = min(deepest, correct_pair(settings, model, work, c, p, work.pair_gap1[c], busy))
         busy = busy & (deepest < -3.0 * settings.slop)
         if not any_lane(busy):
             break

@@ -1,7 +1,7 @@
 """Frames: one picture of a `Recording` at one step, drawn in memory, without a window.
 
-A frame is a list of coloured polygons in metres, back to front: ground, walls, trail, body. The camera turns
-metres into pixels; text and colour bars are laid over the result.
+A frame is made of coloured polygons in metres, back to front: ground, walls, gas, trail, springs and masses.
+The camera turns metres into pixels; text and colour bars are laid over the result.
 """
 
 from __future__ import annotations
@@ -112,11 +112,10 @@ class Painter:
         for shape in self.walls:
             self._fill(step, [shape])
         self._draw_ruler(step)
-        gas, frame = body_shapes(self.recording, step, self.pressure_range, self.strain_range)
-        trail = trail_shapes(self.recording, self.com, step)
-        self._fill(step, gas)
-        self._fill(step, trail)
-        self._fill(step, frame + centre_shapes(self.com[step], self.camera.scale))
+        self._draw_gas(step)
+        self._fill(step, trail_shapes(self.recording, self.com, step))
+        body = body_shapes(self.recording, step, self.strain_range)
+        self._fill(step, body + centre_shapes(self.com[step], self.camera.scale))
         self._draw_readings(step)
         self._draw_pointers(step)
         return self._surface
@@ -201,6 +200,14 @@ class Painter:
             if labelled:
                 label = self._label(metres)
                 self._surface.blit(label, (round(x - label.get_width() / 2), round(top + 15 * zoom)))
+
+    def _draw_gas(self, step: int) -> None:
+        """The chambers, straight onto the frame: springs hide their edges, and nothing shines through."""
+        position = self.camera.pixels(step, np.asarray(self.recording.position[step], dtype=np.float64))
+        levels = level(self.recording.pressure[step], self.pressure_range)
+        for share, loop in zip(levels, self.recording.body.chambers, strict=True):
+            corners = position[list(loop)].tolist()
+            _pygame().draw.polygon(self._surface, shade(PRESSURE_MAP, share), corners)
 
     def _height(self, x: float) -> float | None:
         """Height of the ground at x [m]; None: there is none."""
@@ -456,15 +463,9 @@ def trail_shapes(recording: Recording, com: np.ndarray, step: int) -> list[Shape
     return list(zip(map(tuple, colours), path, strict=True))
 
 
-def body_shapes(
-    recording: Recording, step: int, pressure_range: tuple[float, float], strain_range: tuple[float, float]
-) -> tuple[list[Shape], list[Shape]]:
-    """The gas; the springs and masses around it."""
+def body_shapes(recording: Recording, step: int, strain_range: tuple[float, float]) -> list[Shape]:
+    """Springs, then masses."""
     body, position = recording.body, np.asarray(recording.position[step], dtype=np.float64)
-    gas = level(recording.pressure[step], pressure_range)
-    inside: list[Shape] = [
-        (shade(PRESSURE_MAP, p), position[list(loop)]) for p, loop in zip(gas, body.chambers, strict=True)
-    ]
     side = float(body.side.mean())
     a, b = position[body.springs[:, 0]], position[body.springs[:, 1]]
     shapes: list[Shape] = [(INK, line) for line in thick_lines(a, b, 0.46 * side)]
@@ -474,7 +475,7 @@ def body_shapes(
     for touching, edge, face in zip(touch, squares(body, position), squares(body, position, 0.72), strict=True):
         shapes.append((TOUCHING_EDGE if touching else MASS_EDGE, edge))
         shapes.append((TOUCHING if touching else MASS, face))
-    return inside, shapes
+    return shapes
 
 
 def centre_shapes(com: np.ndarray, scale: float) -> list[Shape]:

@@ -105,7 +105,7 @@ def _encode(
             container.mux(stream.encode(frame))
 
         with ThreadPoolExecutor(1) as encoder:
-            before = encoder.submit(int)
+            before = encoder.submit(int)  # nothing yet
             for k, step in enumerate(steps):
                 picture = pictures[k % 2]
                 _copy(painter.surface(step), picture)
