@@ -1,12 +1,22 @@
 """Contacts: which masses touch the scene or each other, in one fixed order.
 
-Masses in turn, each with the segments of its column in the order of the scene; then pairs (a, b) in the order of
-the model. A contact that any lane of the block has is in the list; in the other lanes its normal is 0, so that it
+Pairs (a, b) in the order of the model; then masses in turn, each with the segments of its column from the last of the
+scene to the first: Box2D's order, while contacts are made in the order of the scene. A contact that any lane of the block has is in the list; in the other lanes its normal is 0, so that it
 does nothing there. Thus an agent's contacts are solved in the same order, whatever its neighbours do.
 """
 
-from turgor.physics.lanes import any_lane, fill, inlined, lane_bits, lowest_bit, rare, select, stage
-from turgor.physics.manifold import NO_ID, NO_POINT, kept, segment_on_face, square_on_segment, square_on_square
+from turgor.physics.lanes import any_lane, fill, inlined, lane_bits, lowest_bit, rare, select, select_mask, stage
+from turgor.physics.manifold import (
+    NO_ID,
+    face_on_segment,
+    kept,
+    largest,
+    nearest_face,
+    pick,
+    segment_on_face,
+    separation_of_squares,
+    square_on_square,
+)
 from turgor.physics.model import MARGIN, NOWHERE
 
 FAR_BELOW = -1e9  # [m], where the segment of an empty slot lies
@@ -44,19 +54,30 @@ def add_ground_contact(settings, model, state, work, i, slot, count):
     px = state.px[slot] - x
     py = state.py[slot] - y
     above = -(nx * px + ny * py)
-    if not any_lane((above <= model.half[i] * 1.4143 + settings.reach) & (above >= -depth)):
+    gap_segment = above - state.extent[slot]
+    if not any_lane((gap_segment <= settings.reach) & (above >= -depth)):
         state.ground_live[slot] = 0
         return count
 
     half = model.half[i]
     qx = state.qx[slot] - x
     qy = state.qy[slot] - y
-    touches, on_face, face, u1, w1, u2, w2, gap_a, id_a, gap_b, id_b = square_on_segment(
-        settings, half, model.cosine[i], model.sine[i], nx, ny, depth, px, py, qx, qy
+    gap_face, face, u1, w1, u2, w2 = nearest_face(half, model.cosine[i], model.sine[i], px, py, qx, qy)
+    behind = above < 0.0
+    over = (min(px, qx) <= 0.0) & (max(px, qx) >= 0.0)
+    near = (gap_segment <= settings.reach) & (above >= -depth)
+    touches = near & ((~behind & (gap_face <= settings.reach)) | (behind & over & (depth > 0.0)))
+    if not any_lane(touches):
+        state.ground_live[slot] = 0
+        return count
+
+    on_face = touches & ~behind & (gap_face > 0.98 * gap_segment + 0.001)
+    gap_a, id_a, gap_b, id_b, left = face_on_segment(
+        half, nx, ny, px, py, qx, qy, above, behind, state.facing[slot], state.lean[slot], state.tilt[slot]
     )
     if any_lane(on_face):
-        face_a, face_id_a, face_b, face_id_b, left = segment_on_face(half, face, u1, w1, u2, w2)
-        touches = touches & (left | ~on_face)
+        face_a, face_id_a, face_b, face_id_b, face_left = segment_on_face(half, face, u1, w1, u2, w2)
+        left = select_mask(on_face, face_left, left)
         gap_a = select(on_face, face_a, gap_a)
         id_a = select(on_face, face_id_a, id_a)
         gap_b = select(on_face, face_b, gap_b)
@@ -64,8 +85,9 @@ def add_ground_contact(settings, model, state, work, i, slot, count):
         # the normal is that of the square's face, towards the square
         c = fill(state.x, model.cosine[i])
         s = fill(state.x, model.sine[i])
-        nx = select(on_face, -select(face == 0.0, s, select(face == 1.0, c, select(face == 2.0, -s, -c))), nx)
-        ny = select(on_face, -select(face == 0.0, -c, select(face == 1.0, s, select(face == 2.0, c, -s))), ny)
+        nx = select(on_face, pick(face, -s, -c, s, c), nx)
+        ny = select(on_face, pick(face, c, -s, -c, s), ny)
+    touches = touches & left
     touches, gap0, id0, gap1, id1 = kept(settings.reach, touches, gap_a, id_a, gap_b, id_b)
     if not any_lane(touches):
         state.ground_live[slot] = 0
@@ -128,7 +150,7 @@ def enter_columns(settings, model, state, work, i, lanes):
         state.listed[i, lane] = model.listed[cell]
         carry_impulses(settings, state, work, first, lane)
         for k in range(slots):
-            fill_slot(settings, model, state, work, first, k, lane, model.candidate[cell * slots + k])
+            fill_slot(settings, model, state, work, i, k, lane, model.candidate[cell * slots + k])
     used = 0
     for lane in range(settings.lanes):
         used = max(used, state.listed[i, lane])
@@ -169,9 +191,9 @@ def carry_impulses(settings, state, work, first, lane):
 
 
 @inlined
-def fill_slot(settings, model, state, work, first, k, lane, segment):
+def fill_slot(settings, model, state, work, i, k, lane, segment):
     """Puts a segment into slot k of a lane, with the impulses that were set aside for it."""
-    slot = first + k
+    slot = i * settings.slots + k
     state.segment[slot, lane] = segment
     if segment == NOWHERE:
         state.px[slot, lane] = 0.0
@@ -179,6 +201,7 @@ def fill_slot(settings, model, state, work, first, k, lane, segment):
         state.nx[slot, lane] = 0.0
         state.ny[slot, lane] = 1.0
         state.depth[slot, lane] = 0.0
+        state.extent[slot, lane] = 0.0
     else:
         state.px[slot, lane] = model.x1[segment]
         state.py[slot, lane] = model.y1[segment]
@@ -187,6 +210,13 @@ def fill_slot(settings, model, state, work, first, k, lane, segment):
         state.nx[slot, lane] = model.nx[segment]
         state.ny[slot, lane] = model.ny[segment]
         state.depth[slot, lane] = model.depth[segment]
+        along_a = model.nx[segment] * model.cosine[i] + model.ny[segment] * model.sine[i]
+        along_b = model.ny[segment] * model.cosine[i] - model.nx[segment] * model.sine[i]
+        against, face = largest_of(along_b, -along_a, -along_b, along_a)
+        state.facing[slot, lane] = face
+        state.lean[slot, lane] = -against
+        state.tilt[slot, lane] = along_a if face == 0 else along_b if face == 1 else -along_a if face == 2 else -along_b
+        state.extent[slot, lane] = model.half[i] * (abs(along_a) + abs(along_b))
     if state.ground_live[slot] != 0:
         state.ground_id0[slot, lane] = NO_ID
         state.ground_id1[slot, lane] = NO_ID
@@ -203,6 +233,23 @@ def fill_slot(settings, model, state, work, first, k, lane, segment):
             state.ground_tangent0[slot, lane] = work.carried_tangent0[old]
             state.ground_normal1[slot, lane] = work.carried_normal1[old]
             state.ground_tangent1[slot, lane] = work.carried_tangent1[old]
+
+
+@inlined
+def largest_of(v0, v1, v2, v3):
+    """The largest of four numbers and which it is; the first of equal ones."""
+    best = v0
+    face = 0
+    if v1 > best:
+        best = v1
+        face = 1
+    if v2 > best:
+        best = v2
+        face = 2
+    if v3 > best:
+        best = v3
+        face = 3
+    return best, face
 
 
 @stage
@@ -224,19 +271,25 @@ def find_pair_contacts(settings, model, state, work):
 @inlined
 def add_pair_contact(settings, model, state, work, p, a, b, dx, dy, count):
     """Lists the contact of pair p, if any lane has it; returns the new count."""
-    touches, nx, ny, gap0, id0, gap1, id1 = square_on_square(
-        settings.reach,
-        model.half[a],
-        model.half[b],
-        model.cosine[a],
-        model.sine[a],
-        model.cosine[b],
-        model.sine[b],
-        model.pair_cosine[p],
-        model.pair_sine[p],
-        dx,
-        dy,
+    half_a = model.half[a]
+    half_b = model.half[b]
+    cos_a = model.cosine[a]
+    sin_a = model.sine[a]
+    cos_b = model.cosine[b]
+    sin_b = model.sine[b]
+    c = model.pair_cosine[p]
+    s = model.pair_sine[p]
+    gap_a, face_a, au, aw, gap_b, face_b, bu, bw = separation_of_squares(
+        half_a, half_b, cos_a, sin_a, cos_b, sin_b, c, s, dx, dy
     )
+    near = max(gap_a, gap_b) <= settings.reach
+    if not any_lane(near):
+        state.pair_live[p] = 0
+        return count
+    nx, ny, gap0, id0, gap1, id1, left = square_on_square(
+        settings.reach, half_a, half_b, cos_a, sin_a, cos_b, sin_b, c, s, gap_a, face_a, au, aw, gap_b, face_b, bu, bw
+    )
+    touches, gap0, id0, gap1, id1 = kept(settings.reach, near & left, gap0, id0, gap1, id1)
     if not any_lane(touches):
         state.pair_live[p] = 0
         return count

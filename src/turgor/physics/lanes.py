@@ -195,6 +195,16 @@ def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
 
 
 @intrinsic
+def select_mask(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
+    """`select` of two masks."""
+
+    def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        return builder.select(*values)
+
+    return mask(mask, a, b), emit
+
+
+@intrinsic
 def fill(typingctx: Any, view: Any, value: Any) -> Any:
     """`value` in every lane, as a value of the rows of `view`."""
 

@@ -9,7 +9,7 @@ A point's id says what made it, so that its impulse can be found again in the ne
 and the corner 4 or 5 where the face's own first or second end cuts the other's edge.
 """
 
-from turgor.physics.lanes import inlined, select
+from turgor.physics.lanes import any_lane, inlined, select
 
 NO_POINT = 1e9  # [m], gap of a point that is not there
 NO_ID = -1.0
@@ -67,50 +67,42 @@ def clip(gap0, eta0, id0, gap1, eta1, id1, low, high):
 
 
 @inlined
-def square_on_segment(settings, half, cosine, sine, nx, ny, depth, q1x, q1y, q2x, q2y):
-    """Contact of a square with a segment whose ends are seen from the square's centre at q1 and q2 [m]: whether it
-    touches, and whether its nearest `face` is the reference, not the segment; the face and the segment's ends in the
-    square's axes, for `segment_on_face`; the two points with the segment as the reference."""
-    reach = settings.reach
-    above = -(nx * q1x + ny * q1y)  # the centre's height over the segment's line
-    na = nx * cosine + ny * sine
-    nb = ny * cosine - nx * sine
-    gap_segment = above - half * (abs(na) + abs(nb))
+def nearest_face(half, cosine, sine, px, py, qx, qy):
+    """The face of a square from which a segment is furthest, and how far [m]; the segment's ends, p and q from the
+    square's centre, in the square's own axes."""
+    u1 = px * cosine + py * sine
+    w1 = py * cosine - px * sine
+    u2 = qx * cosine + qy * sine
+    w2 = qy * cosine - qx * sine
+    gap, face = largest(-max(w1, w2), min(u1, u2), min(w1, w2), -max(u1, u2))
+    return gap - half, face, u1, w1, u2, w2
 
-    # the segment in the square's own axes, and its distance from each face
-    u1 = q1x * cosine + q1y * sine
-    w1 = q1y * cosine - q1x * sine
-    u2 = q2x * cosine + q2y * sine
-    w2 = q2y * cosine - q2x * sine
-    gap_face, face = largest(-max(w1, w2) - half, min(u1, u2) - half, min(w1, w2) - half, -max(u1, u2) - half)
 
-    behind = above < 0.0
-    over = (min(q1x, q2x) <= 0.0) & (max(q1x, q2x) >= 0.0)
-    touches = (
-        (gap_segment <= reach) & (above >= -depth) & ((~behind & (gap_face <= reach)) | (behind & over & (depth > 0.0)))
-    )
+@inlined
+def face_on_segment(half, nx, ny, px, py, qx, qy, above, behind, face, lean, tilt):
+    """The square's face that looks most against a segment's normal, cut to the segment's ends:
+    (gap0, id0, gap1, id1, any left). What is behind the segment is not cut.
 
-    # the segment as the reference: the square's most antiparallel face, its corners over the segment's ends
-    xi, other = largest(nb, -na, -nb, na)
-    xi = -xi
-    along = pick(other, na, nb, -na, -nb)
-    centre = ny * q1x - nx * q1y
-    length = nx * (q2y - q1y) - ny * (q2x - q1x)
-    gap0 = above + half * (xi - along)
-    gap1 = above + half * (xi + along)
-    id0 = other
-    id1 = select(other == 3.0, 0.0, other + 1.0)
-    gap_a, id_a, gap_b, id_b, left = clip(
-        gap0, centre - half * (along + xi), id0, gap1, centre - half * (along - xi), id1, 0.0, length
-    )
-    # what is behind is pushed out over all its width
-    gap_a = select(behind, gap0, gap_a)
-    gap_b = select(behind, gap1, gap_b)
-    id_a = select(behind, id0, id_a)
-    id_b = select(behind, id1, id_b)
-    on_face = touches & ~behind & (gap_face > 0.98 * gap_segment + 0.001)
-    touches = touches & (left | behind | on_face)
-    return touches, on_face, face, u1, w1, u2, w2, gap_a, id_a, gap_b, id_b
+    `lean` and `tilt` are the components along the segment's normal of the face's normal and tangent.
+    """
+    gap0 = above + half * (lean - tilt)
+    gap1 = above + half * (lean + tilt)
+    id0 = face
+    id1 = select(face == 3.0, 0.0, face + 1.0)
+    centre = ny * px - nx * py
+    eta0 = centre - half * (tilt + lean)
+    eta1 = centre - half * (tilt - lean)
+    length = nx * (qy - py) - ny * (qx - px)
+    left = above == above
+    # eta1 < eta0, because the face looks against the segment
+    if any_lane((eta1 < 0.0) | (eta0 > length)):
+        gap_a, id_a, gap_b, id_b, left = clip(gap0, eta0, id0, gap1, eta1, id1, 0.0, length)
+        gap0 = select(behind, gap0, gap_a)
+        gap1 = select(behind, gap1, gap_b)
+        id0 = select(behind, id0, id_a)
+        id1 = select(behind, id1, id_b)
+        left = left | behind
+    return gap0, id0, gap1, id1, left
 
 
 @inlined
@@ -138,20 +130,25 @@ def kept(reach, touches, gap_a, id_a, gap_b, id_b):
 
 
 @inlined
-def square_on_square(reach, half_a, half_b, cos_a, sin_a, cos_b, sin_b, turn_cos, turn_sin, dx, dy):
-    """Contact of square b, whose centre stands at (dx, dy) from that of a:
-    (touches, nx, ny, gap0, id0, gap1, id1), the normal from a to b."""
+def separation_of_squares(half_a, half_b, cos_a, sin_a, cos_b, sin_b, turn_cos, turn_sin, dx, dy):
+    """For square b, whose centre stands at (dx, dy) from that of a: (gap [m], face) of the face of a that is furthest
+    from b, and b's centre in a's axes; then the same of b."""
     lean = abs(turn_cos) + abs(turn_sin)
-    au = dx * cos_a + dy * sin_a  # b's centre in a's axes
+    au = dx * cos_a + dy * sin_a
     aw = dy * cos_a - dx * sin_a
-    bu = -(dx * cos_b + dy * sin_b)  # a's centre in b's axes
+    bu = -(dx * cos_b + dy * sin_b)
     bw = -(dy * cos_b - dx * sin_b)
     gap_a, face_a = largest(-aw, au, aw, -au)
     gap_b, face_b = largest(-bw, bu, bw, -bu)
-    gap_a = gap_a - (half_a + half_b * lean)
-    gap_b = gap_b - (half_b + half_a * lean)
-    touches = (gap_a <= reach) & (gap_b <= reach)
+    return gap_a - (half_a + half_b * lean), face_a, au, aw, gap_b - (half_b + half_a * lean), face_b, bu, bw
 
+
+@inlined
+def square_on_square(
+    reach, half_a, half_b, cos_a, sin_a, cos_b, sin_b, turn_cos, turn_sin, gap_a, face_a, au, aw, gap_b, face_b, bu, bw
+):
+    """Contact of two squares of a known separation: (nx, ny, gap0, id0, gap1, id1, any left), the normal from a to
+    b."""
     # from here on in the axes of the reference square, with the other one relative to it
     flip = gap_b > 0.98 * gap_a + 0.001
     face = select(flip, face_b, face_a)
@@ -187,5 +184,4 @@ def square_on_square(reach, half_a, half_b, cos_a, sin_a, cos_b, sin_b, turn_cos
     nx = sign * pick(face, sr, cr, -sr, -cr)
     ny = sign * pick(face, -cr, sr, cr, -sr)
     base = 8.0 * (face + select(flip, 5.0, 1.0))
-    touches, gap0, id0, gap1, id1 = kept(reach, touches & left, gap0, id0 + base, gap1, id1 + base)
-    return touches, nx, ny, gap0, id0, gap1, id1
+    return nx, ny, gap0, id0 + base, gap1, id1 + base, left

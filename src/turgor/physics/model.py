@@ -113,6 +113,8 @@ class Model(NamedTuple):
     pair_reach: Annotated[FloatTable, "pair"]  # [m], centres further apart in x or y cannot touch
     pair_cosine: Annotated[FloatTable, "pair"]  # of b's angle seen from a
     pair_sine: Annotated[FloatTable, "pair"]
+    pair_share_a: Annotated[FloatTable, "pair"]  # of the pair's relative velocity that changes at a: m_b / (m_a + m_b)
+    pair_share_b: Annotated[FloatTable, "pair"]
 
 
 class State(NamedTuple):
@@ -144,6 +146,12 @@ class State(NamedTuple):
     nx: Annotated[Floats, "slot"]
     ny: Annotated[Floats, "slot"]
     depth: Annotated[Floats, "slot"]
+    # ... seen by this square, which does not turn: the face that looks most against the normal, the components of
+    # that face's normal and tangent along the segment's normal, and the largest extent of the square along it
+    facing: Annotated[Floats, "slot"]
+    lean: Annotated[Floats, "slot"]
+    tilt: Annotated[Floats, "slot"]
+    extent: Annotated[Floats, "slot"]  # [m]
     # impulses of the last contact's two points, for the warm start, per unit of mass: [mass, slot]
     ground_live: Annotated[IntTable, "slot"]  # whether any lane has one
     ground_id0: Annotated[Floats, "slot"]
@@ -152,7 +160,7 @@ class State(NamedTuple):
     ground_tangent0: Annotated[Floats, "slot"]
     ground_normal1: Annotated[Floats, "slot"]
     ground_tangent1: Annotated[Floats, "slot"]
-    # the same for each pair [N s]
+    # the same for each pair, per unit of effective mass
     pair_live: Annotated[IntTable, "pair"]
     pair_id0: Annotated[Floats, "pair"]
     pair_id1: Annotated[Floats, "pair"]
@@ -200,7 +208,7 @@ class Work(NamedTuple):
     pair_ny: Annotated[Floats, "pair"]
     pair_gap0: Annotated[Floats, "pair"]
     pair_gap1: Annotated[Floats, "pair"]
-    pair_normal: Annotated[Floats, "pair"]  # [N s]
+    pair_normal: Annotated[Floats, "pair"]  # [m/s]
     pair_tangent: Annotated[Floats, "pair"]
 
 
@@ -469,6 +477,8 @@ def _pair_tables(body: Body, skin: float) -> dict[str, np.ndarray]:
     joined = {frozenset(pair) for pair in body.springs.tolist()}
     n = body.mass_count
     pairs = [(a, b) for a in range(n) for b in range(a + 1, n) if frozenset((a, b)) not in joined]
+    # in this order neighbours in the list rarely share a mass, and so need not wait for each other
+    pairs.sort(key=lambda pair: (pair[1] - pair[0], pair[0]))
     a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     turn = body.angle[b] - body.angle[a]
     extent = _mass_tables(body)["extent"]
@@ -478,4 +488,6 @@ def _pair_tables(body: Body, skin: float) -> dict[str, np.ndarray]:
         "pair_reach": extent[a] + extent[b] + 2 * skin + MARGIN,
         "pair_cosine": np.cos(turn),
         "pair_sine": np.sin(turn),
+        "pair_share_a": body.mass[b] / (body.mass[a] + body.mass[b]),
+        "pair_share_b": body.mass[a] / (body.mass[a] + body.mass[b]),
     }

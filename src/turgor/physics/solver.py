@@ -4,8 +4,8 @@ Contact of a body with normal n and tangent t = (n_y, -n_x); friction before the
 
     lambda_t = -m_eff (dv t),   |J_t| <= mu J_n            lambda_n = -m_eff (dv n),   J_n >= 0
 
-with the impulses J accumulated over iterations and steps. On the ground impulses are per unit of mass, so that
-m_eff = 1. A square's two points are redundant, since it cannot turn: velocities use the first, positions both.
+with the impulses J accumulated over iterations and steps. They are kept per unit of effective mass, as velocities:
+m_eff = 1, and a mass m of a pair takes the share m_eff / m of the change. A square's two points are redundant, since it cannot turn: velocities use the first, positions both.
 """
 
 import math
@@ -31,10 +31,12 @@ def warm_start_contacts(model, state, work, grounds, pairs):
         ny = work.pair_ny[c]
         px = work.pair_normal[c] * nx + work.pair_tangent[c] * ny
         py = work.pair_normal[c] * ny - work.pair_tangent[c] * nx
-        state.vx[a] -= px * model.inverse_mass[a]
-        state.vy[a] -= py * model.inverse_mass[a]
-        state.vx[b] += px * model.inverse_mass[b]
-        state.vy[b] += py * model.inverse_mass[b]
+        share_a = model.pair_share_a[work.pair[c]]
+        share_b = model.pair_share_b[work.pair[c]]
+        state.vx[a] -= px * share_a
+        state.vy[a] -= py * share_a
+        state.vx[b] += px * share_b
+        state.vy[b] += py * share_b
 
 
 @stage
@@ -42,7 +44,7 @@ def solve_velocities(settings, model, state, work, grounds, pairs):
     """The velocity iterations; the impulses are kept for the next step's warm start."""
     for _ in range(settings.velocity_iterations):
         solve_springs(settings, model, state, work)
-        solve_pairs(settings, model, state, work, pairs)
+        solve_pairs(model, state, work, settings.pair_friction, pairs)
         solve_grounds(settings, state, work, grounds)
     for c in range(grounds):
         state.ground_normal0[work.ground_slot[c]] = work.ground_normal[c]
@@ -73,28 +75,34 @@ def solve_grounds(settings, state, work, grounds):
 
 
 @inlined
-def solve_pairs(settings, model, state, work, pairs):
+def solve_pairs(model, state, work, friction, pairs):
     for c in range(pairs):
-        a = model.pair_a[work.pair[c]]
-        b = model.pair_b[work.pair[c]]
-        mass = 1.0 / (model.inverse_mass[a] + model.inverse_mass[b])
+        p = work.pair[c]
+        a = model.pair_a[p]
+        b = model.pair_b[p]
+        share_a = model.pair_share_a[p]
+        share_b = model.pair_share_b[p]
         nx = work.pair_nx[c]
         ny = work.pair_ny[c]
-        vx = state.vx[b] - state.vx[a]
-        vy = state.vy[b] - state.vy[a]
+        ax = state.vx[a]
+        ay = state.vy[a]
+        bx = state.vx[b]
+        by = state.vy[b]
+        vx = bx - ax
+        vy = by - ay
         normal = work.pair_normal[c]
         tangent = work.pair_tangent[c]
-        limit = settings.pair_friction * normal
-        slide = clamp(tangent - mass * (vx * ny - vy * nx), -limit, limit)
-        press = max(normal - mass * (vx * nx + vy * ny), 0.0)
+        limit = friction * normal
+        slide = clamp(tangent - (vx * ny - vy * nx), -limit, limit)
+        press = max(normal - (vx * nx + vy * ny), 0.0)
         work.pair_tangent[c] = slide
         work.pair_normal[c] = press
         px = (slide - tangent) * ny + (press - normal) * nx
         py = (press - normal) * ny - (slide - tangent) * nx
-        state.vx[a] -= px * model.inverse_mass[a]
-        state.vy[a] -= py * model.inverse_mass[a]
-        state.vx[b] += px * model.inverse_mass[b]
-        state.vy[b] += py * model.inverse_mass[b]
+        state.vx[a] = ax - px * share_a
+        state.vy[a] = ay - py * share_a
+        state.vx[b] = bx + px * share_b
+        state.vy[b] = by + py * share_b
 
 
 @stage
@@ -124,22 +132,41 @@ def correct_positions(settings, model, state, work, grounds, pairs):
         deepest = fill(state.x, 0.0)
         for c in range(pairs):
             p = work.pair[c]
-            deepest = min(deepest, correct_pair(settings, model, work, c, p, work.pair_gap0[c], busy))
-            deepest = min(deepest, correct_pair(settings, model, work, c, p, work.pair_gap1[c], busy))
+            a = model.pair_a[p]
+            b = model.pair_b[p]
+            share_a = model.pair_share_a[p]
+            share_b = model.pair_share_b[p]
+            nx = work.pair_nx[c]
+            ny = work.pair_ny[c]
+            ax = work.dx[a]
+            ay = work.dy[a]
+            bx = work.dx[b]
+            by = work.dy[b]
+            closer = nx * (bx - ax) + ny * (by - ay)
+            gap = work.pair_gap0[c] + closer
+            deepest = min(deepest, gap)
+            first = correction(settings, gap, busy)
+            # the first point's correction, along the same normal, has moved the second
+            gap = work.pair_gap1[c] + (closer - first)
+            deepest = min(deepest, gap)
+            push = first + correction(settings, gap, busy)
+            work.dx[a] = ax + push * share_a * nx
+            work.dy[a] = ay + push * share_a * ny
+            work.dx[b] = bx - push * share_b * nx
+            work.dy[b] = by - push * share_b * ny
         for c in range(grounds):
             i = work.ground_mass[c]
             nx = work.ground_nx[c]
             ny = work.ground_ny[c]
             dx = work.dx[i]
             dy = work.dy[i]
-            gap = work.ground_gap0[c] + (nx * dx + ny * dy)
+            closer = nx * dx + ny * dy
+            gap = work.ground_gap0[c] + closer
             deepest = min(deepest, gap)
-            push = correction(settings, gap, busy)
-            dx -= push * nx
-            dy -= push * ny
-            gap = work.ground_gap1[c] + (nx * dx + ny * dy)
+            first = correction(settings, gap, busy)
+            gap = work.ground_gap1[c] + (closer - first)
             deepest = min(deepest, gap)
-            push = correction(settings, gap, busy)
+            push = first + correction(settings, gap, busy)
             work.dx[i] = dx - push * nx
             work.dy[i] = dy - push * ny
         busy = busy & (deepest < -3.0 * settings.slop)
@@ -148,22 +175,6 @@ def correct_positions(settings, model, state, work, grounds, pairs):
     for i in range(settings.masses):
         state.x[i] += work.dx[i]
         state.y[i] += work.dy[i]
-
-
-@inlined
-def correct_pair(settings, model, work, c, p, gap, busy):
-    """Moves both masses of pair p apart by their share; returns the gap [m] that it met."""
-    a = model.pair_a[p]
-    b = model.pair_b[p]
-    nx = work.pair_nx[c]
-    ny = work.pair_ny[c]
-    gap = gap + (nx * (work.dx[b] - work.dx[a]) + ny * (work.dy[b] - work.dy[a]))
-    push = correction(settings, gap, busy) / (model.inverse_mass[a] + model.inverse_mass[b])
-    work.dx[a] += push * model.inverse_mass[a] * nx
-    work.dy[a] += push * model.inverse_mass[a] * ny
-    work.dx[b] -= push * model.inverse_mass[b] * nx
-    work.dy[b] -= push * model.inverse_mass[b] * ny
-    return gap
 
 
 @inlined
