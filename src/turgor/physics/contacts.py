@@ -136,7 +136,7 @@ def recall(new, old0, impulse0, old1, impulse1):
 def enter_columns(settings, model, state, work, i, lanes):
     """Copies the column that mass i is in to each of `lanes` (bits), and takes along the impulses of the segments
     that the old column had too."""
-    reach = model.extent[i] + settings.reach + MARGIN
+    reach = model.extent[i] + 1.4143 * settings.reach + MARGIN
     slots = settings.slots
     first = i * slots
     while lanes != 0:

@@ -16,9 +16,12 @@ from turgor.physics.lanes import Floats, FloatTable, Ints, IntTable, aligned, fi
 from turgor.scene import Scene
 from turgor.task import Leave, Task
 
-WIDTH = 16  # agents in a block: one AVX-512 vector; see ARCHITECTURE.md
+WIDTH = 32  # agents in a block: two AVX-512 vectors; see ARCHITECTURE.md
 NOWHERE = -1
-MARGIN = 1e-3  # [m], slack of the search for candidates over the exact tests
+# [m], slack of the search for candidates over the exact tests, against rounding. A candidate search that misses a
+# contact shows as an agent that depends on its neighbours: shapes are apart when they are `2 skin` apart along the
+# normal of any face, so that corners can be sqrt(2) times as far away.
+MARGIN = 1e-3
 
 # where commands come from
 CONTROLLER, COMMANDS, REPLAY = 0, 1, 2
@@ -351,7 +354,7 @@ def _pressure_source(task: Task) -> int:
 
 def _margin(body: Body, skin: float) -> float:
     """How far from a mass's centre it can meet a segment [m]."""
-    return float(body.side.max()) * math.sqrt(0.5) + 2 * skin + MARGIN
+    return math.sqrt(2) * (float(body.side.max()) / 2 + 2 * skin) + MARGIN
 
 
 def _mass_tables(body: Body) -> dict[str, np.ndarray]:
@@ -485,7 +488,7 @@ def _pair_tables(body: Body, skin: float) -> dict[str, np.ndarray]:
     return {
         "pair_a": a,
         "pair_b": b,
-        "pair_reach": extent[a] + extent[b] + 2 * skin + MARGIN,
+        "pair_reach": extent[a] + extent[b] + math.sqrt(2) * 2 * skin + MARGIN,
         "pair_cosine": np.cos(turn),
         "pair_sine": np.sin(turn),
         "pair_share_a": body.mass[b] / (body.mass[a] + body.mass[b]),
