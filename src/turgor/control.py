@@ -8,38 +8,14 @@
 
 from __future__ import annotations
 
-import math
-from typing import Literal, get_args
-
-import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
 from turgor.body import Body
-from turgor.errors import InvalidInput, describe, one_of
-
-Observation = Literal["signed", "unit"]
-Condition = Literal["pressure", "springs", "passive"]
-
-
-class Sensing(msgspec.Struct, frozen=True):
-    """What is observed: touch of each mass; x, y of each mass relative to the centre of mass; velocity of
-    the centre of mass; pressure of each chamber. 3 masses + 2 + chambers values."""
-
-    window: int = 25  # [step], averaged over; fewer at the start
-    observation: Observation = "signed"  # "unit": signed values v become (v + 1) / 2
-    position_scale: float = 1.75  # [1], relative positions are divided by this many body radii
-    velocity_scale: float = 20.0  # [m/s]
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.window, int) or not 1 <= self.window <= 10_000:
-            raise InvalidInput("window: expected a whole number of steps, 1 to 10000", describe(self.window))
-        if self.observation not in get_args(Observation):
-            raise one_of("observation", get_args(Observation), self.observation)
-        for name in ("position_scale", "velocity_scale"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidInput(f"{name}: expected a positive number", describe(value))
+from turgor.errors import InvalidInput, describe
+from turgor.variants import Condition
+from turgor.variants import Observation as Observation
+from turgor.variants import Sensing as Sensing
 
 
 def observation_count(body: Body) -> int:
@@ -60,7 +36,7 @@ def parameter_count(body: Body, condition: Condition) -> int:
 
 
 def rows(theta: np.ndarray, body: Body, condition: Condition) -> tuple[np.ndarray, np.ndarray]:
-    """The controller as (weights [agent, output, observation], biases [agent, output]) of `theta` [agent, parameter]."""
+    """Weights [agent, output, observation] and biases [agent, output] of `theta` [agent, parameter]."""
     agents, inputs = len(theta), observation_count(body)
     weights, biases, at = [], [], 0
     springs = body.spring_count if condition != "passive" else 0

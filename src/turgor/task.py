@@ -10,7 +10,7 @@ import hashlib
 import inspect
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -21,38 +21,20 @@ from turgor.body import GAS_CONSTANT, Body
 from turgor.control import Condition, Sensing, parameter_count
 from turgor.errors import InvalidInput, describe, one_of
 from turgor.scene import Scene
+from turgor.variants import (
+    VARIANT_GROUPS,
+    Cage,
+    Elements,
+    Fitness,
+    General,
+    Hills,
+    Inflation,
+    Physics,
+    variant_names,
+)
+from turgor.variants import PressureLength as PressureLength
 
 REST_GAP = 0.015  # [m] between the lowest corner and the ground at a resting start
-Fitness = Literal["progress", "distance", "elapsed", "area"]
-PressureLength = Literal["true", "commanded"]
-
-
-class Physics(msgspec.Struct, frozen=True):
-    """The world's and the solver's numbers; the defaults are the `paper` preset (Box2D 2.3's solver)."""
-
-    gravity: float = 10.0  # [m/s^2], downwards
-    dt: float = 1 / 60  # [s]
-    velocity_iterations: int = 8
-    position_iterations: int = 3  # at most
-    slop: float = 0.005  # [m], penetration that is left alone
-    baumgarte: float = 0.2  # [1], share of the penetration corrected by an iteration
-    max_correction: float = 0.2  # [m], by an iteration
-    max_travel: float = 2.0  # [m], by a step
-    skin: float = 0.01  # [m], around squares and segments
-    temperature: float = 288.15  # [K]
-    pressure_max: float = 1.25  # [1], p_max / (nRT / (pi r^2))
-    pressure_min: float = 0.2  # [1], p_min / p_max
-    area_min: float = 0.01  # [1], smallest area for the gas law / (pi r^2)
-    pressure_length: PressureLength = "true"  # "commanded": the paper's program, which makes momentum from nothing
-
-    def __post_init__(self) -> None:
-        for name in self.__struct_fields__:
-            value = getattr(self, name)
-            if name == "pressure_length":
-                if value not in get_args(PressureLength):
-                    raise one_of(name, get_args(PressureLength), value)
-            elif not math.isfinite(value) or value < 0 or (value == 0 and name in ("dt", "temperature", "max_travel")):
-                raise InvalidInput(f"{name}: expected a number that is not negative", describe(value))
 
 
 class Leave(msgspec.Struct, frozen=True, tag="leave"):
@@ -183,63 +165,6 @@ def given_rows(name: str, values: Any, steps: int, count: int) -> np.ndarray:
 HILL_HEIGHT = {"small": 1.0, "medium": 2.0, "large": 3.0}  # [m], standard deviation
 
 
-class Hills(msgspec.Struct, frozen=True):
-    """Numbers of the hilly terrain."""
-
-    hill_height: float | None = None  # [m]; None: 1, 2, 3 for small, medium, large; r / 5 for other bodies
-    hill_step: float = 10.0  # [m], mean distance of two vertices
-    hill_step_spread: float = 0.25  # [1], its standard deviation / mean
-    hill_extent: float = 400.0  # [m]
-
-
-class Cage(msgspec.Struct, frozen=True):
-    """Numbers of the cage; the defaults are the paper's text."""
-
-    cage_width: float | None = None  # [m] between the walls; None: 3 r
-    cage_roof: float | None = None  # [m]; None: 2 r + 1, and 3 r for escape-authors
-    cage_aperture: float | None = None  # [m]; None: a third of the roof, and r for escape-authors
-    cage_wall: float = 1.0  # [m], thickness
-
-
-class Inflation(msgspec.Struct, frozen=True):
-    """Numbers of the validation by inflation: p(t) = clip((t - rest) / ramp, 0, 1) p_max in step t."""
-
-    rest_steps: int = 360
-    ramp_steps: int = 100
-
-
-class Elements(msgspec.Struct, frozen=True):
-    """Numbers of the body's elements; the defaults are those of `Body`."""
-
-    mass_count: int | None = None  # None: 10, 15, 20 for small, medium, large
-    radius: float | None = None  # [m]; None: 5, 7.5, 10
-    gas_amount: float | None = None  # [mol]; None: 1400.67, 2101.005, 2801.34
-    side: float = 1.0  # [m]
-    density: float = 2500.0  # [kg/m^2]
-    friction: float = 10.0  # [1], of the masses
-    frequency: float = 8.0  # [Hz], of the springs
-    damping_ratio: float = 0.3  # [1], of the springs
-    shortest: float = 0.75  # [1], commanded length / rest length
-    longest: float = 1.25  # [1], commanded length / rest length
-
-
-class General(msgspec.Struct, frozen=True):
-    """Numbers of the task itself."""
-
-    steps: int = 1800
-    fitness: Fitness | None = None  # None: "progress" on flat and hilly, "distance" on escape, "area" on inflation
-    pressure_unit: float | None = None  # [Pa]; None: p_max / 1000
-    ground_friction: float = 0.2  # [1], of ground, roof and walls
-
-
-VARIANT_GROUPS: tuple[type[msgspec.Struct], ...] = (General, Physics, Sensing, Elements, Hills, Cage, Inflation)
-
-
-def variant_names() -> dict[str, type[msgspec.Struct]]:
-    """Every number that `make_task` takes as a keyword argument, with the group that holds its default."""
-    return {name: group for group in VARIANT_GROUPS for name in group.__struct_fields__}
-
-
 def make_task(
     name: str = "hilly",
     *,
@@ -299,7 +224,7 @@ def _make_body(body: str | Body, elements: Elements) -> Body:
 
 def resting(body: Body, x: float = 0.0) -> np.ndarray:
     """Start [m], shape [mass, 2]: the body at rest on y = 0, its lowest square 0.015 m above touching."""
-    return body.position + [x, REST_GAP - body.lowest_corner()]
+    return body.position + np.array([x, REST_GAP - body.lowest_corner()])
 
 
 def _common(name: str, body: Body, condition: Condition, groups: dict[type, Any], fitness: Fitness) -> dict[str, Any]:
@@ -327,7 +252,7 @@ def _hilly(name: str, size: str, body: Body, condition: Condition, seed: int, gr
         extent=numbers.hill_extent,
         friction=groups[General].ground_friction,
     )
-    start = body.position + [0.0, r + 1 + scenes.highest_ground(scene, -r - 1, r + 1)]
+    start = body.position + np.array([0.0, r + 1 + scenes.highest_ground(scene, -r - 1, r + 1)])
     return Task(scene=scene, position=start, **_common(name, body, condition, groups, "progress"))
 
 

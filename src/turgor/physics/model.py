@@ -16,7 +16,7 @@ from turgor.physics.lanes import Floats, FloatTable, Ints, IntTable, aligned, fi
 from turgor.scene import Scene
 from turgor.task import Leave, Task
 
-WIDTH = 32  # agents in a block: two AVX-512 vectors; see ARCHITECTURE.md
+WIDTH = 16  # agents in a block: one AVX-512 vector; see ARCHITECTURE.md
 NOWHERE = -1
 # [m], slack of the search for candidates over the exact tests, against rounding. A candidate search that misses a
 # contact shows as an agent that depends on its neighbours: shapes are apart when they are `2 skin` apart along the

@@ -1,0 +1,309 @@
+"""The loop: a strategy is asked for a generation, the simulator judges it, the run records it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from turgor.errors import InvalidInput, describe
+from turgor.evolve.strategy import CMAES, Degenerate, Strategy
+from turgor.runs import Champion, Run, Settings, current_versions
+from turgor.simulate import Rollout, Simulator, perturbed
+from turgor.task import Task
+
+CHECKPOINT_INTERVAL = 10.0  # [s]
+MakeStrategy = Callable[[int, np.random.Generator], Strategy]  # of the number of parameters and the randomness
+
+
+class Progress(msgspec.Struct, frozen=True, kw_only=True):
+    """Where a run stands after a generation."""
+
+    generation: int
+    evaluations: int
+    budget: int  # evaluations to reach
+    best: float  # so far
+    median: float  # of the generation
+    sigma: float  # that the generation was drawn with
+    evaluations_per_second: float
+    seconds_left: float
+
+
+def evolve(
+    task: Task,
+    evaluations: int = 10_000,
+    seed: int = 0,
+    out: str | os.PathLike[str] | None = None,
+    *,
+    strategy: MakeStrategy = CMAES,
+    threads: int | None = None,
+    progress: Callable[[Progress], object] | None = None,
+    robust_repeats: int = 30,
+    recipe: Mapping[str, Any] | None = None,
+) -> Run:
+    """The `Run` that evolves a controller for `task`: its champion, its history and, in the folder `out`, its files.
+
+    Whole generations are evaluated until there are at least `evaluations`. The champion is the best agent of all;
+    then it runs again from `robust_repeats` starts moved by 1e-6 m, of which the median is its robust fitness: the
+    best of many is partly luck. An agent whose fitness is NaN counts as worse than every other.
+
+    The same `seed` gives the same bits whatever the number of `threads` (None: all cores). `strategy` makes the
+    optimizer, as in `functools.partial(CMAES, population=100)`. `progress` is called after every generation.
+    `recipe` is kept in run.json: the arguments of `make_task`. `out=None` keeps everything in memory.
+
+    Ctrl-C ends it after the generation in hand, a second one at once: what was evolved is kept in `out`,
+    `resume` goes on from there, and `KeyboardInterrupt` is raised. Raises `InvalidInput` for a task without anything
+    to evolve, a folder that is not empty, or where no agent of the first generation has a fitness.
+    """
+    started = time.perf_counter()
+    for name, value in (("evaluations", evaluations), ("robust_repeats", robust_repeats)):
+        if not isinstance(value, int) or value < 1:
+            raise InvalidInput(f"{name}: expected a whole number, at least 1", describe(value))
+    if not isinstance(seed, int) or seed < 0:
+        raise InvalidInput("seed: expected a whole number, 0 or more", describe(seed))
+    if task.parameter_count == 0:
+        raise InvalidInput("evolve: expected a condition that controls something", f"{task.name}, {task.condition}")
+    simulator = Simulator(task, threads=threads)
+    optimizer = strategy(task.parameter_count, np.random.default_rng(seed))
+    settings = Settings(
+        evaluations=evaluations,
+        seed=seed,
+        strategy=optimizer.name,
+        population=optimizer.population,
+        threads=simulator.threads,
+        robust_repeats=robust_repeats,
+        recipe=None if recipe is None else dict(recipe),
+    )
+    run = Run.create(task, settings, out)
+    return _carry_on(run, simulator, optimizer, progress, started)
+
+
+def resume(
+    run: Run,
+    evaluations: int | None = None,
+    *,
+    strategy: MakeStrategy = CMAES,
+    threads: int | None = None,
+    progress: Callable[[Progress], object] | None = None,
+) -> Run:
+    """`run`, taken up where it was left, to its end or to `evaluations`: with the same bits as without the pause.
+
+    It goes on from its last checkpoint; what came after is evolved again. `strategy` is what `evolve` was given.
+    Raises `InvalidInput` for a run that has no evaluations left, or whose checkpoint cannot be read.
+    """
+    started = time.perf_counter()
+    settings = run.settings
+    budget = settings.evaluations if evaluations is None else evaluations
+    if not isinstance(budget, int) or budget < 1:
+        raise InvalidInput("evaluations: expected a whole number, at least 1", describe(budget))
+    if run.status == "done" and run.evaluations >= budget:
+        raise InvalidInput(f"evaluations: expected more than the {run.evaluations} that are done", str(budget))
+    if run.status == "done" and run.note:
+        raise InvalidInput(f"resume: expected a run that can go on; {run.note}")
+    simulator = Simulator(run.task, threads=threads)
+    optimizer = strategy(run.task.parameter_count, np.random.default_rng(settings.seed))
+    if optimizer.name != settings.strategy:
+        raise InvalidInput(f"strategy: expected {settings.strategy}", optimizer.name)
+    state = run.read_checkpoint()
+    if state is not None:
+        optimizer.restore(state)
+    if optimizer.population != settings.population:
+        raise InvalidInput(f"strategy: expected a population of {settings.population}", str(optimizer.population))
+    run.settings = msgspec.structs.replace(settings, evaluations=budget, threads=simulator.threads)
+    run.status, run.note, run.versions = "running", None, current_versions()
+    run.write_record()
+    return _carry_on(run, simulator, optimizer, progress, started)
+
+
+def evaluate(simulator: Simulator, theta: ArrayLike, repeats: int = 30, size: float = 1e-6) -> Rollout:
+    """A `Rollout` of one controller, `theta` [parameter], from `repeats` starts that differ by `size` [m]."""
+    thetas = np.repeat(np.asarray(theta, dtype=np.float64)[None], repeats, axis=0)
+    return simulator.rollout(thetas, perturbed(simulator.task.position, repeats, size))
+
+
+def _carry_on(
+    run: Run,
+    simulator: Simulator,
+    optimizer: Strategy,
+    progress: Callable[[Progress], object] | None,
+    started: float,
+) -> Run:
+    """Evolves `run` to its end and writes it down, whatever ends it."""
+    clock = _Clock(run.seconds, started)
+    with _gentle_interrupt() as interrupt:
+        try:
+            _generations(run, simulator, optimizer, progress, clock, interrupt)
+            run.status = "done"
+        except Degenerate as reason:
+            run.status, run.note = "done", f"stopped in generation {run.generation + 1}: {reason}"
+        except KeyboardInterrupt:
+            run.status = "interrupted"
+            raise
+        except Exception as error:
+            run.status, run.note = "failed", describe(error)
+            raise
+        finally:
+            if run.status == "done":
+                with clock.of("simulation"):
+                    _measure_champion(run, simulator)
+            # a strategy that stopped, or was stopped amid its work, has no state to go on from
+            whole = run.status != "failed" and run.note is None and not interrupt.forced
+            _save(run, optimizer if whole else None, clock)
+            run.close()
+    if interrupt.wanted:
+        raise KeyboardInterrupt
+    return run
+
+
+def _generations(
+    run: Run,
+    simulator: Simulator,
+    optimizer: Strategy,
+    progress: Callable[[Progress], object] | None,
+    clock: _Clock,
+    interrupt: _Interrupt,
+) -> None:
+    saved, first = time.perf_counter(), run.evaluations
+    with clock.of("start"):
+        simulator.rollout(np.zeros((0, run.task.parameter_count)))  # compiles or loads the engine
+    began = time.perf_counter()
+    while run.evaluations < run.settings.evaluations:
+        sigma = optimizer.sigma
+        with clock.of("strategy"):
+            theta = optimizer.ask()
+        with clock.of("simulation"):
+            out = simulator.rollout(theta)
+        median = _note_generation(run, theta, out, sigma, clock.total())
+        with clock.of("strategy"):
+            optimizer.tell(theta, out.fitness)
+        now = time.perf_counter()
+        if progress is not None:
+            rate = (run.evaluations - first) / (now - began)
+            progress(_progress(run, median, sigma, rate))
+        if interrupt.wanted:
+            raise KeyboardInterrupt
+        if now - saved > CHECKPOINT_INTERVAL:
+            _save(run, optimizer, clock)
+            saved = time.perf_counter()
+
+
+def _note_generation(run: Run, theta: np.ndarray, out: Rollout, sigma: float, seconds: float) -> float:
+    """Adds a generation to the history, its best to the champions; returns its median fitness."""
+    generation = run.generation + 1
+    fitness = np.where(np.isnan(out.fitness), -np.inf, out.fitness)
+
+    def better(than: Champion | None, among: np.ndarray) -> Champion | None:
+        k = int(np.argmax(np.where(among, fitness, -np.inf)))
+        if not (among[k] and math.isfinite(fitness[k]) and (than is None or fitness[k] > than.fitness)):
+            return than
+        return Champion(
+            theta=theta[k].copy(),
+            fitness=float(fitness[k]),
+            steps=int(out.steps[k]),
+            solved=bool(out.solved[k]),
+            generation=generation,
+        )
+
+    run.champion = better(run.champion, np.isfinite(fitness))
+    if run.task.end is not None:
+        run.solver = better(run.solver, out.solved & np.isfinite(fitness))
+    if run.champion is None:
+        raise InvalidInput("fitness: expected a finite number from an agent of the first generation", "none")
+    ordered = np.sort(fitness)
+    half = len(ordered) // 2
+    median = float(ordered[half] if len(ordered) % 2 else ordered[half - 1 : half + 1].mean())
+    run.add((generation, run.evaluations + len(theta), run.champion.fitness, median, float(sigma), round(seconds, 3)))
+    return median
+
+
+def _measure_champion(run: Run, simulator: Simulator) -> None:
+    if run.champion is not None and run.champion.robust is None:
+        out = evaluate(simulator, run.champion.theta, run.settings.robust_repeats)
+        run.champion = msgspec.structs.replace(run.champion, robust=out.fitness, robust_solved=out.solved)
+
+
+def _progress(run: Run, median: float, sigma: float, rate: float) -> Progress:
+    return Progress(
+        generation=run.generation,
+        evaluations=run.evaluations,
+        budget=run.settings.evaluations,
+        best=run.rows[-1][2],
+        median=median,
+        sigma=sigma,
+        evaluations_per_second=rate,
+        seconds_left=max(run.settings.evaluations - run.evaluations, 0) / rate,
+    )
+
+
+def _save(run: Run, optimizer: Strategy | None, clock: _Clock) -> None:
+    """Writes down everything; run.json last, because it says that the others are there."""
+    run.write_champion()
+    if optimizer is not None:
+        run.write_checkpoint(optimizer.state())
+    run.seconds = clock.seconds()
+    run.write_record()
+
+
+class _Clock:
+    """Where the time goes, on top of what earlier sessions of the run took."""
+
+    def __init__(self, before: Mapping[str, float], started: float) -> None:
+        self._parts = {"start": 0.0, "simulation": 0.0, "strategy": 0.0}
+        self._parts |= {name: seconds for name, seconds in before.items() if name in self._parts}
+        self._parts["start"] += time.perf_counter() - started
+        self._started = started - before.get("total", 0.0)
+
+    @contextlib.contextmanager
+    def of(self, part: str) -> Generator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._parts[part] += time.perf_counter() - began
+
+    def total(self) -> float:
+        return time.perf_counter() - self._started
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds of every part, of the rest and of all."""
+        total = self.total()
+        return {**self._parts, "rest": total - sum(self._parts.values()), "total": total}
+
+
+class _Interrupt:
+    wanted = False  # after this generation
+    forced = False  # at once
+
+
+@contextlib.contextmanager
+def _gentle_interrupt() -> Generator[_Interrupt]:
+    """Has the first Ctrl-C noted and the second one raised, so that no generation is torn apart.
+
+    Only in the main thread, which alone gets signals, and where nobody else handles them.
+    """
+    interrupt = _Interrupt()
+
+    def handle(*_: object) -> None:
+        interrupt.forced = interrupt.wanted
+        interrupt.wanted = True
+        if interrupt.forced:
+            raise KeyboardInterrupt
+
+    here = threading.current_thread() is threading.main_thread()
+    if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield interrupt
+        return
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield interrupt
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,0 +1,256 @@
+"""Strategies: optimizers that are asked for controllers and told how good they were."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from turgor.errors import InvalidInput, describe
+
+WORST = 1e300  # cost of an agent without a fitness: finite, so that sums stay finite
+LARGEST_CONDITION = 1e14  # of the covariance: beyond it float64 cannot tell its axes; pycma's own limit
+SMALLEST_SIGMA = 1e-150  # its square is still a number
+LARGEST_NUMBER = 1e15  # [1], of a controller: what the simulator takes
+UINT64 = 2**64
+
+
+class Degenerate(Exception):
+    """A strategy that cannot go on, because its numbers have lost their meaning; says why."""
+
+
+class Strategy(Protocol):
+    """An optimizer that maximises. Between `tell` and the next `tell`, `state` is all that it knows."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def population(self) -> int:
+        """Agents in a generation."""
+        ...
+
+    @property
+    def sigma(self) -> float:
+        """Size of the steps that it takes [1]."""
+        ...
+
+    def ask(self) -> np.ndarray:
+        """The next generation, theta [agent, parameter]. Raises `Degenerate`."""
+        ...
+
+    def tell(self, theta: np.ndarray, fitness: np.ndarray) -> None:
+        """Learns from the `fitness` [agent] of what `ask` returned; NaN counts as worst. Raises `Degenerate`."""
+        ...
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on, as arrays (no objects)."""
+        ...
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Goes on from `state`, bit by bit as the strategy that it was taken from. Raises `InvalidInput`."""
+        ...
+
+
+class CMAES:
+    """CMA-ES (pycma): full covariance, active weights, cumulative step-size adaptation.
+
+        strategy = CMAES(374, np.random.default_rng(0))
+        theta = strategy.ask()
+        strategy.tell(theta, fitness)
+
+    Its initial mean is uniform in [-1, 1]. All randomness is the generator's; the bits are the same for the same
+    generator on the same machine, whatever the number of threads. It never ends by itself, apart from `Degenerate`.
+    Step sizes adapt by the length of the evolution path (CSA) for every number of parameters; pycma would take two
+    mirrored agents of each generation from 300 parameters on (TPA).
+    """
+
+    name = "cma-es"
+    # What pycma's object carries from one generation to the next, with these options.
+    _OF_EVOLUTION = ("mean", "sigma", "pc", "countiter", "countevals")
+    _OF_SAMPLER = ("C", "B", "D", "last_update", "count_tell", "count_eigen")
+    _OF_STEP_SIZE = ("ps", "_ps_updated_iteration", "delta")
+
+    def __init__(
+        self,
+        parameter_count: int,
+        rng: np.random.Generator,
+        *,
+        population: int | None = None,
+        sigma: float = 0.5,
+        mean: ArrayLike | None = None,
+    ) -> None:
+        """`population`: None for 4 + floor(3 ln parameter_count); `mean` [parameter]: None for uniform in [-1, 1].
+
+        Raises `InvalidInput`.
+        """
+        if parameter_count < 1:
+            raise InvalidInput("evolve: expected a task with something to evolve", "a controller without parameters")
+        population = 4 + math.floor(3 * math.log(parameter_count)) if population is None else population
+        if not isinstance(population, int) or population < 4:
+            raise InvalidInput("population: expected a whole number, at least 4", describe(population))
+        if not (math.isfinite(sigma) and sigma > 0):
+            raise InvalidInput("sigma: expected a positive number", describe(sigma))
+        if not isinstance(rng.bit_generator, np.random.PCG64):
+            kind = type(rng.bit_generator).__name__
+            raise InvalidInput("rng: expected a generator on PCG64 (numpy.random.default_rng)", kind)
+        mean = rng.uniform(-1, 1, parameter_count) if mean is None else np.array(mean, dtype=np.float64)
+        if mean.shape != (parameter_count,) or not np.isfinite(mean).all():
+            raise InvalidInput(f"mean: expected {parameter_count} finite numbers", f"shape {list(mean.shape)}")
+        self._rng = rng
+        self._start(mean, float(sigma), population)
+
+    @property
+    def population(self) -> int:
+        return self._evolution.popsize
+
+    @property
+    def sigma(self) -> float:
+        return float(self._evolution.sigma)
+
+    def ask(self) -> np.ndarray:
+        """The next generation, float64 [agent, parameter]."""
+        self._before_ask = _bits(self._rng)
+        with _numerics():
+            theta = np.array(self._evolution.ask())
+        self._check(theta)
+        return theta
+
+    def tell(self, theta: np.ndarray, fitness: np.ndarray) -> None:
+        """Learns from the `fitness` [agent], the higher the better, of `theta` from `ask`. Only its order counts; NaN
+        and -inf are worse than every number."""
+        cost = np.nan_to_num(-np.asarray(fitness, dtype=np.float64), nan=WORST, posinf=WORST, neginf=-WORST)
+        with _numerics():
+            self._evolution.tell(list(theta), np.clip(cost, -WORST, WORST).tolist())
+        self._before_ask = _bits(self._rng)
+        self._check(self._evolution.mean)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Arrays from which `restore` goes on; taken between `ask` and `tell`, it goes on with the same `ask`."""
+        evolution = self._evolution
+        parts = (
+            (evolution, self._OF_EVOLUTION),
+            (evolution.sm, self._OF_SAMPLER),
+            (evolution.adapt_sigma, self._OF_STEP_SIZE),
+        )
+        # order "K": the order of B in memory decides which of BLAS's routines multiplies it
+        arrays = {name: np.array(getattr(part, name), order="K") for part, names in parts for name in names}
+        return {**arrays, "population": np.array(self.population), "generator": self._before_ask.copy()}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Goes on from `state`; number of parameters and population are the state's. Raises `InvalidInput`."""
+        names = (*self._OF_EVOLUTION, *self._OF_SAMPLER, *self._OF_STEP_SIZE, "population", "generator")
+        missing = [name for name in names if name not in state]
+        if missing:
+            raise InvalidInput(f"state of {self.name}: expected {', '.join(names)}", f"no {', '.join(missing)}")
+        n = np.size(state["mean"])
+        shapes = {"mean": (n,), "pc": (n,), "ps": (n,), "D": (n,), "B": (n, n), "C": (n, n), "generator": (6,)}
+        for name in names:
+            value, shape = state[name], shapes.get(name, ())
+            if np.shape(value) != shape or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
+                raise InvalidInput(f"state of {self.name}: expected finite numbers of shape {list(shape)} in {name}")
+        self._start(np.array(state["mean"]), float(state["sigma"]), int(state["population"]))
+        evolution = self._evolution
+        _put(evolution, state, self._OF_EVOLUTION)
+        _put(evolution.sm, state, self._OF_SAMPLER)
+        _put(evolution.adapt_sigma, state, self._OF_STEP_SIZE)
+        evolution._updateBDfromSM()
+        self._before_ask = np.array(state["generator"], dtype=np.uint64)
+        _set_bits(self._rng, self._before_ask)
+
+    def _start(self, mean: np.ndarray, sigma: float, population: int) -> None:
+        cma = _load_pycma()
+        options = {
+            "randn": lambda *shape: self._rng.standard_normal(shape),
+            "seed": math.nan,  # any other seeds NumPy's global generator
+            "popsize": population,
+            "AdaptSigma": cma.sigma_adaptation.CMAAdaptSigmaCSA,
+            # else pycma changes its coordinates on the way, and with them what its state means
+            "conditioncov_alleviate": False,
+            "CMA_mirrors": 0,  # else small populations carry directions from one generation to the next
+            "verbose": -10,
+            "verb_log": 0,
+            "verb_disp": 0,
+        }
+        self._evolution: Any = cma.CMAEvolutionStrategy(mean, sigma, options)
+        self._evolution.mean_old = self._evolution.mean  # `tell` sets it, but asks for it from the second time on
+        self._evolution.timer = cma.utilities.utils.ElapsedWCTime()  # `ask` makes it in the first generation alone
+        self._before_ask = _bits(self._rng)
+
+    def _check(self, numbers: np.ndarray) -> None:
+        evolution = self._evolution
+        sound = np.isfinite(evolution.sm.C).all() and SMALLEST_SIGMA < evolution.sigma < np.inf
+        if not (sound and (np.abs(numbers) <= LARGEST_NUMBER).all()):
+            raise Degenerate("its mean, step size or covariance is no longer a finite number, or too large or small")
+        condition = float(evolution.sm.D[-1] / evolution.sm.D[0]) ** 2
+        if condition > LARGEST_CONDITION:
+            raise Degenerate(f"its covariance's condition number is {condition:.0e}, too large for float64")
+
+
+def _put(part: Any, state: dict[str, np.ndarray], names: tuple[str, ...]) -> None:
+    """Sets fields: arrays as copies in the same order in memory, single numbers as Python's own."""
+    for name in names:
+        value = state[name]
+        setattr(part, name, np.array(value, order="K") if np.ndim(value) else value.item())
+
+
+def _bits(rng: np.random.Generator) -> np.ndarray:
+    """The state of a PCG64 generator, uint64 [6]: state, increment (high, low), whether half a draw is left, it."""
+    bits: Any = rng.bit_generator.state
+    state, inc = bits["state"]["state"], bits["state"]["inc"]
+    numbers = [*divmod(state, UINT64), *divmod(inc, UINT64), bits["has_uint32"], bits["uinteger"]]
+    return np.array(numbers, dtype=np.uint64)
+
+
+def _set_bits(rng: np.random.Generator, bits: np.ndarray) -> None:
+    state_high, state_low, inc_high, inc_low, left, half = (int(b) for b in bits)
+    rng.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": state_high * UINT64 + state_low, "inc": inc_high * UINT64 + inc_low},
+        "has_uint32": left,
+        "uinteger": half,
+    }
+
+
+@cache
+def _blas() -> Any:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")
+
+
+@contextmanager
+def _numerics() -> Generator[None]:
+    """One thread for BLAS (its results depend on their number, and here more of them are slower); what pycma stumbles
+    over becomes `Degenerate`."""
+    try:
+        with _blas().limit(limits=1), np.errstate(over="raise", divide="raise", invalid="raise"):
+            yield
+    except (ArithmeticError, AssertionError, RecursionError, np.linalg.LinAlgError) as error:
+        raise Degenerate(f"its numbers broke down ({type(error).__name__} {error})".replace(" )", ")")) from error
+
+
+@cache
+def _load_pycma() -> Any:
+    """pycma, without the plots and the tests of ranks that it loads but that nothing here uses.
+
+    They would take 3.4 of 4 seconds. Modules that are loaded already stay as they are.
+    """
+    unused = ("matplotlib", "matplotlib.pyplot", "scipy", "scipy.stats")
+    left_out = [name for name in unused if name not in sys.modules and "cma" not in sys.modules]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        sys.modules.update(dict.fromkeys(left_out))  # ty: ignore[no-matching-overload]
+        try:
+            return importlib.import_module("cma")
+        finally:
+            for name in left_out:
+                del sys.modules[name]
