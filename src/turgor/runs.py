@@ -234,7 +234,7 @@ class Run:
         if self.path is None:
             return
         champion = self.champion
-        result = {"generations": self.generation, "evaluations": self.evaluations}
+        result: dict[str, Any] = {"generations": self.generation, "evaluations": self.evaluations}
         if champion is not None:
             result |= {"fitness": champion.fitness, "robust_fitness": champion.robust_fitness}
         record = Record(

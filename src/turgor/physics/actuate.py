@@ -19,27 +19,40 @@ def tanh(x):
 
 @stage
 def control(settings, brain, work):
-    """command = tanh(W_s o + b_s) for springs, W_p o + b_p for chambers."""
+    """command = tanh(W_s o + b_s) for springs, W_p o + b_p for chambers.
+
+    Two outputs at a time share the loads of o; two sums each hide the latency of the additions. Their order is fixed.
+    """
     inputs = settings.inputs
-    whole = inputs - inputs % 4
-    for j in range(settings.outputs):
+    even = inputs - inputs % 2
+    for j in range(0, settings.outputs, 2):
+        last = min(j + 1, settings.outputs - 1)  # an odd number of outputs: the last one twice
         at = j * inputs
-        # four sums hide the latency of the additions; their order is fixed
+        twin = last * inputs
         a = brain.bias[j]
-        b = fill(work.mean, 0.0)
-        c = b
-        d = b
-        for k in range(0, whole, 4):
-            a += brain.weight[at + k] * work.mean[k]
-            b += brain.weight[at + k + 1] * work.mean[k + 1]
-            c += brain.weight[at + k + 2] * work.mean[k + 2]
-            d += brain.weight[at + k + 3] * work.mean[k + 3]
-        for k in range(whole, inputs):
-            a += brain.weight[at + k] * work.mean[k]
-        output = (a + b) + (c + d)
-        if j < settings.springs:
-            output = tanh(output)
-        work.command[j] = output
+        b = brain.bias[last]
+        a_odd = fill(work.mean, 0.0)
+        b_odd = a_odd
+        for k in range(0, even, 2):
+            o = work.mean[k]
+            a += brain.weight[at + k] * o
+            b += brain.weight[twin + k] * o
+            o = work.mean[k + 1]
+            a_odd += brain.weight[at + k + 1] * o
+            b_odd += brain.weight[twin + k + 1] * o
+        if even < inputs:
+            a += brain.weight[at + even] * work.mean[even]
+            b += brain.weight[twin + even] * work.mean[even]
+        work.command[j] = activation(settings, j, a + a_odd)
+        work.command[last] = activation(settings, last, b + b_odd)
+
+
+@inlined
+def activation(settings, j, output):
+    """What row j of the controller gives out."""
+    if j < settings.springs:
+        output = tanh(output)
+    return output
 
 
 @stage

@@ -179,8 +179,7 @@ class Work(NamedTuple):
     # springs, in the order of solving
     ux: Annotated[Floats, "spring"]  # unit vector from tail to head
     uy: Annotated[Floats, "spring"]
-    wx: Annotated[Floats, "spring"]  # effective mass * unit vector [kg]
-    wy: Annotated[Floats, "spring"]
+    link: Annotated[Floats, "spring"]  # how much of the impulse before it in the chain a spring takes on [1]
     bias: Annotated[Floats, "spring"]  # effective mass * bias velocity [N s]
     # commands: one per spring in (-1, 1), then one per chamber
     command: Annotated[Floats, "output"]
