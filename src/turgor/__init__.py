@@ -11,16 +11,32 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from turgor.body import LARGE, MEDIUM, SMALL, Body, ring
-    from turgor.control import Sensing
-    from turgor.errors import InvalidInput
-    from turgor.evolve.loop import evolve
-    from turgor.evolve.strategy import CMAES, Strategy
-    from turgor.recording import Recording
-    from turgor.runs import Run
-    from turgor.scene import Scene, cage, flat, hills
-    from turgor.simulate import Rollout, Simulator, Step, perturbed, replay
-    from turgor.task import Leave, Physics, Task, make_task, resting
+    from turgor.body import LARGE as LARGE
+    from turgor.body import MEDIUM as MEDIUM
+    from turgor.body import SMALL as SMALL
+    from turgor.body import Body as Body
+    from turgor.body import ring as ring
+    from turgor.control import Sensing as Sensing
+    from turgor.errors import InvalidInput as InvalidInput
+    from turgor.evolve.loop import evolve as evolve
+    from turgor.evolve.strategy import CMAES as CMAES
+    from turgor.evolve.strategy import Strategy as Strategy
+    from turgor.recording import Recording as Recording
+    from turgor.runs import Run as Run
+    from turgor.scene import Scene as Scene
+    from turgor.scene import cage as cage
+    from turgor.scene import flat as flat
+    from turgor.scene import hills as hills
+    from turgor.simulate import Rollout as Rollout
+    from turgor.simulate import Simulator as Simulator
+    from turgor.simulate import Step as Step
+    from turgor.simulate import perturbed as perturbed
+    from turgor.simulate import replay as replay
+    from turgor.task import Leave as Leave
+    from turgor.task import Physics as Physics
+    from turgor.task import Task as Task
+    from turgor.task import make_task as make_task
+    from turgor.task import resting as resting
 
 # One canonical path per name; a module is imported when its first name is asked for, so that
 # `import turgor` and the command line answer at once.

@@ -200,7 +200,7 @@ def _loops(value: Sequence[Sequence[int]], count: int) -> tuple[tuple[int, ...],
 
 # The amounts of gas are those that the paper's program computed (grams times molar mass); the printed 0.05 to
 # 0.1 kg never lift the body. See docs/replication.md.
-SIZES = {
+SIZES: dict[str, dict[str, Any]] = {
     "small": {"mass_count": 10, "radius": 5.0, "gas_amount": 1400.67},
     "medium": {"mass_count": 15, "radius": 7.5, "gas_amount": 2101.005},
     "large": {"mass_count": 20, "radius": 10.0, "gas_amount": 2801.34},

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,12 @@ from turgor import physics
 from turgor.body import Body
 from turgor.control import check_theta, observation_count, output_count, rows
 from turgor.errors import InvalidInput, describe
-from turgor.physics.lanes import BYTES, Width, aligned
+from turgor.physics.lanes import Width, aligned
 from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH, Brain, Kernel, Result, State, Work, make_kernel
 from turgor.physics.step import run_blocks
 from turgor.recording import Recording
 from turgor.scene import LARGEST_COORDINATE, Scene
-from turgor.task import Leave, Physics, Task, given_rows, start_position
+from turgor.task import Physics, Task, given_rows, start_position
 
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
 
@@ -154,7 +155,7 @@ class Simulator:
                 if t == 0:
                     trace[0] = here[0]
             position = batch.stand()["position"]
-            done = np.asarray(task.end(position), dtype=bool)  # ty: ignore[call-non-callable]
+            done = np.asarray(task.end(position), dtype=bool)  # ty: ignore[not-callable]
             if done.shape != (batch.agents,):
                 raise InvalidInput(f"end: expected bools of shape [{batch.agents}]", f"shape {list(done.shape)}")
             ended = (steps == 0) & (done | (t == task.steps - 1))
@@ -376,7 +377,7 @@ def _parts(agents: int, threads: int) -> list[slice]:
     blocks = -(-agents // WIDTH)
     count = max(min(threads, blocks), -(-blocks // BLOCKS_AT_ONCE))
     bounds = [agents * k // count for k in range(count + 1)] if count else []
-    return [slice(a, b) for a, b in zip(bounds, bounds[1:], strict=False)]
+    return [slice(a, b) for a, b in pairwise(bounds)]
 
 
 @lru_cache
@@ -394,15 +395,13 @@ def _width() -> Width:
 @lru_cache
 def _load_kernel() -> None:
     """Has the kernel ready, compiled or from the cache; says so if that takes a while."""
-    notice = threading.Timer(
-        1.0, print, ["turgor: compiling the engine for this processor, once ..."], {"file": sys.stderr}
-    )
+    said = "turgor: compiling the engine for this processor, once ..."
+    notice = threading.Timer(1.5, print, [said], {"file": sys.stderr, "flush": True})
     notice.daemon = True
     notice.start()
+    body = Body([[0.0, 0.0]])
+    task = Task(name="nothing", body=body, scene=Scene([]), position=body.position, condition="passive")
     try:
-        body = Body([[0.0, 0.0]])
-        empty = _Batch(make_kernel(Task(name="", body=body, scene=Scene([]), position=body.position, condition="passive")),
-                       np.zeros((0, 1, 2)))  # fmt: skip
-        empty.run(CONTROLLER, 0, 0, 0)
+        _Batch(make_kernel(task), np.zeros((0, 1, 2))).run(CONTROLLER, first=0, steps=0, last=0)
     finally:
         notice.cancel()

@@ -1,8 +1,9 @@
 """Contacts: which masses touch the scene or each other, in one fixed order.
 
 Pairs (a, b) in the order of the model; then masses in turn, each with the segments of its column from the last of the
-scene to the first: Box2D's order, while contacts are made in the order of the scene. A contact that any lane of the block has is in the list; in the other lanes its normal is 0, so that it
-does nothing there. Thus an agent's contacts are solved in the same order, whatever its neighbours do.
+scene to the first: Box2D's order, newest first, while contacts are made in the order of the scene. A contact that any
+lane of the block has is in the list; in the other lanes its normal is 0, so that it does nothing there. Thus an agent's
+contacts are solved in the same order, whatever its neighbours do.
 """
 
 from turgor.physics.lanes import any_lane, fill, inlined, lane_bits, lowest_bit, rare, select, select_mask, stage
@@ -10,7 +11,6 @@ from turgor.physics.manifold import (
     NO_ID,
     face_on_segment,
     kept,
-    largest,
     nearest_face,
     pick,
     segment_on_face,

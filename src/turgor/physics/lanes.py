@@ -28,16 +28,14 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils
+from numba.core import cgutils, extending
 from numba.core.extending import (
-    intrinsic,
+    NativeValue,
     lower_builtin,
     models,
     register_model,
-    type_callable,
     typeof_impl,
     unbox,
-    NativeValue,
 )
 from numba.core.imputils import lower_cast
 from numba.core.typeconv import Conversion
@@ -45,6 +43,12 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 
 LINE = 64  # [byte], a cache line and the widest vector
 BYTES = 4  # of a float32 and an int32
+
+
+def intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Numba's `intrinsic`, typed as it is called: without the typing context."""
+    return extending.intrinsic(function)
+
 
 # One of these above every function of the kernel. No fast-math: see above.
 stage = njit(error_model="numpy", boundscheck=False, forceinline=True)
@@ -82,7 +86,7 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, lanes, lanes.llvm)
 
 
-def _splat(builder: ir.IRBuilder, value: ir.Value, width: int) -> ir.Value:
+def _splat(builder: ir.IRBuilder, value: Any, width: int) -> ir.Value:
     empty = ir.Constant(ir.VectorType(value.type, width), ir.Undefined)
     first = builder.insert_element(empty, value, ir.IntType(32)(0))
     return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(ir.IntType(32), width), [0] * width))
@@ -340,7 +344,7 @@ def _row_pointer(builder: Any, view: View, pointer: Any, index: Any) -> Any:
     if view.width is None:
         return builder.gep(pointer, [index])
     first = builder.gep(pointer, [builder.mul(index, index.type(view.width))])
-    return builder.bitcast(first, view.row.llvm.as_pointer())
+    return builder.bitcast(first, Lanes(view.kind, view.width).llvm.as_pointer())
 
 
 def _number_pointer(builder: Any, view: View, pointer: Any, index: Any) -> Any:
@@ -393,13 +397,18 @@ class IntTable:
     """int32 numbers that all lanes share."""
 
 
-FIELD = {Floats: ("float", True), Ints: ("int", True), FloatTable: ("float", False), IntTable: ("int", False)}
+FIELD: dict[Any, tuple[str, bool]] = {
+    Floats: ("float", True),
+    Ints: ("int", True),
+    FloatTable: ("float", False),
+    IntTable: ("int", False),
+}
 
 
 def fields(views: type) -> dict[str, tuple[type, str]]:
     """{field: (annotation, name of its length)} of a NamedTuple of views."""
     hints = get_type_hints(views, include_extras=True)
-    return {name: get_args(hints[name]) for name in views._fields}  # ty: ignore[unresolved-attribute]
+    return {name: get_args(hints[name]) for name in views._fields}  # ty: ignore[missing-attribute]
 
 
 def layout(views: type, lengths: Mapping[str, int], width: int) -> np.ndarray:

@@ -6,6 +6,7 @@ A block is `width` agents side by side, one per lane. Its State and Work are row
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -256,10 +257,9 @@ class Kernel(NamedTuple):
         return field_of(buffer, view, self.layouts[VIEWS.index(view)], name, self.lengths, width)
 
     def size(self, view: type) -> int:
-        """Numbers that one block needs for a `view` (State: and Work, which follows it)."""
-        return int(
-            self.layouts[VIEWS.index(Work if view is State else view)][len(fields(view if view is not State else Work))]
-        )
+        """Numbers in one block's buffer for a `view`; State and Work, behind it, share one."""
+        last = Work if view is State else view
+        return int(self.layouts[VIEWS.index(last), len(fields(last))])
 
 
 VIEWS = (Model, State, Work, Brain, Result, Script)
@@ -437,7 +437,7 @@ def _scene_tables(scene: Scene, margin: float) -> dict[str, np.ndarray]:
     high = np.maximum(segments[:, 0], segments[:, 2]) + margin
     cuts = np.unique(np.float32(np.concatenate([low, high])))
     column = np.concatenate([[-np.inf], cuts, [np.inf]])
-    lists = [np.flatnonzero((low < b) & (high > a)) for a, b in zip(column, column[1:], strict=False)]
+    lists = [np.flatnonzero((low < b) & (high > a)) for a, b in pairwise(column)]
     slots = max([1, *(len(found) for found in lists)])
     candidate = np.full((len(lists), slots), NOWHERE)
     floor, ceiling = np.full(len(lists), -np.inf), np.full(len(lists), np.inf)

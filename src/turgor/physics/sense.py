@@ -10,7 +10,7 @@ def clamp(value, low, high):
 
 @stage
 def sense(settings, model, state, work, t):
-    """Pushes  o = (touch, relative positions, velocity, pressures)  after step t into the window, and renews the mean."""
+    """Pushes  o = (touch, relative positions, velocity, pressures)  after t steps into the window; renews the mean."""
     n = settings.masses
     slot = t % settings.window
     at = slot * settings.inputs

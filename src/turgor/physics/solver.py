@@ -5,7 +5,8 @@ Contact of a body with normal n and tangent t = (n_y, -n_x); friction before the
     lambda_t = -m_eff (dv t),   |J_t| <= mu J_n            lambda_n = -m_eff (dv n),   J_n >= 0
 
 with the impulses J accumulated over iterations and steps. They are kept per unit of effective mass, as velocities:
-m_eff = 1, and a mass m of a pair takes the share m_eff / m of the change. A square's two points are redundant, since it cannot turn: velocities use the first, positions both.
+m_eff = 1, and a mass m of a pair takes the share m_eff / m of the change. A square's two points are redundant, since it
+cannot turn: velocities use the first, positions both.
 """
 
 import math

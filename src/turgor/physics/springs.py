@@ -3,8 +3,9 @@
     C = |x_h - x_t| - rest,   u = (x_h - x_t) / |x_h - x_t|,   Cdot = u (v_h - v_t)
     lambda = -M (Cdot + bias + gamma J),   M = 1 / (1/m_t + 1/m_h + gamma),   bias = C h k gamma
 
-from the tail t to the head h of each spring. J is the accumulated impulse. In a chain each spring's tail is the head of
-the one before it, so that lambda depends on the lambda before. With z = u / m_h that is one multiplication and addition:
+from the tail t to the head h of each spring. J is the accumulated impulse. In a chain each spring's tail is the head
+of the one before it, so that lambda depends on the lambda before. With z = u / m_h that is one multiplication and one
+addition, and the rest need not wait:
 
     v_t = v_t(before) + z' lambda',   lambda = -(M (u v_h - u v_t(before) + bias) + M gamma J) + (M u z') lambda'
 """

@@ -131,7 +131,7 @@ def record(settings, state, work, trace, row):
         trace.row[at + k] = work.mean[k]
 
 
-def run_blocks(
+def _run_blocks(
     width, settings, tables, memory, brains, scripts, traces, results, layouts, position, velocity,
     drive, first_step, steps, last_step,
 ):  # fmt: skip
@@ -166,6 +166,6 @@ def run_blocks(
 # be written to, there is no cache.
 _compile = partial(njit, nogil=True, error_model="numpy", boundscheck=False)
 try:
-    run_blocks = _compile(cache=True)(run_blocks)
+    run_blocks = _compile(cache=True)(_run_blocks)
 except RuntimeError:
-    run_blocks = _compile()(run_blocks)
+    run_blocks = _compile()(_run_blocks)

@@ -1,0 +1,208 @@
+"""The paper's agent on the real Box2D, through pybox2d: one agent, one core, as fast as reasonable in Python.
+
+    python benchmarks/box2d_peer.py [BODY]      prints how fast it is with a random controller
+
+It is what a careful author would write without an engine of their own: everything that does not change is laid out
+once, positions and velocities are read through live views of Box2D's vectors, one force per mass, one NumPy product
+for the controller, a contact listener instead of lists of contacts. `turgor bench` runs it beside the engine, and
+the tests hold the two together over the first steps. Needs the package `box2d`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+
+from turgor.control import rows
+from turgor.task import Physics, Task, make_task
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # turned into an error, its DeprecationWarning would crash the interpreter
+    import Box2D
+
+
+class Touches(Box2D.b2ContactListener):
+    """How many things each mass touches; Box2D tells what changed, at the start of its step."""
+
+    def __init__(self, mass_count: int) -> None:
+        super().__init__()
+        self.count = [0] * mass_count
+
+    def BeginContact(self, contact: Any) -> None:
+        self._add(contact, 1)
+
+    def EndContact(self, contact: Any) -> None:
+        self._add(contact, -1)
+
+    def _add(self, contact: Any, change: int) -> None:
+        for fixture in (contact.fixtureA, contact.fixtureB):
+            mass = fixture.body.userData
+            if mass is not None:  # the ground
+                self.count[mass] += change
+
+
+class Agent:
+    """One agent of `task` with controller `theta` [parameter], in a Box2D world of its own."""
+
+    def __init__(self, task: Task, theta: np.ndarray) -> None:
+        check_task(task)
+        body, n = task.body, task.body.mass_count
+        self.physics = task.physics
+        self.touches = Touches(n)
+        self.world = make_world(task, self.touches)
+        self.masses = add_masses(self.world, task)
+        self.springs = add_springs(self.world, task, self.masses)
+        # live views: they read Box2D's own numbers, and live as long as the world
+        self.position = [mass.position for mass in self.masses]
+        self.velocity = [mass.linearVelocity for mass in self.masses]
+        self.share = body.mass / body.mass.sum()
+
+        # observations: touch, x of all, y of all, velocity, pressure; theta has x and y of each mass together
+        order = np.concatenate([np.arange(n), n + 2 * np.arange(n), n + 2 * np.arange(n) + 1, [3 * n, 3 * n + 1, 3 * n + 2]])
+        weight, bias = rows(np.reshape(theta, (1, -1)), body, task.condition)
+        self.weight, self.bias = np.ascontiguousarray(weight[0][:, order]), bias[0]
+        self.position_scale = task.sensing.position_scale * body.radius
+        self.velocity_scale = task.sensing.velocity_scale
+        self.low = np.concatenate([np.zeros(n), np.full(2 * n + 2, -1.0), [0.0]])
+        self.window = np.zeros((task.sensing.window, 3 * n + 3))
+        self.total = np.zeros(3 * n + 3)  # of the window
+        self.steps = 0
+
+        loop = np.array(body.chambers[0])
+        self.after, self.before = np.empty(n, int), np.empty(n, int)
+        self.after[loop], self.before[loop] = np.roll(loop, -1), np.roll(loop, 1)
+        self.rest = body.rest_length
+        self.shorten, self.lengthen = (1 - body.shortest) * self.rest, (body.longest - 1) * self.rest
+        self.pressure = float(task.pressure_start[0])
+        self.pressure_min, self.pressure_max = task.pressure_range[0].tolist()
+        self.pressure_step = float(task.pressure_step[0])
+
+    def step(self) -> None:
+        """Sense, control, actuate, push, solve."""
+        state = self.read()
+        output = self.weight @ self.sense(state) + self.bias
+        self.actuate(output)
+        self.push(state[:2])
+        self.world.Step(self.physics.dt, self.physics.velocity_iterations, self.physics.position_iterations)
+        self.steps += 1
+
+    def read(self) -> np.ndarray:
+        """x, y [m] and velocity x, y [m/s] of all masses, shape [4, mass]."""
+        p, v = self.position, self.velocity
+        return np.array([[a.x for a in p], [a.y for a in p], [a.x for a in v], [a.y for a in v]])
+
+    def sense(self, state: np.ndarray) -> np.ndarray:
+        """The mean of the last observations, as many as the window holds."""
+        n, observation = len(self.masses), self.window[self.steps % len(self.window)]
+        self.total -= observation
+        centre = state @ self.share
+        observation[:n] = self.touches.count
+        observation[n : 3 * n] = ((state[:2] - centre[:2, None]) / self.position_scale).ravel()
+        observation[3 * n : 3 * n + 2] = centre[2:] / self.velocity_scale
+        observation[-1] = self.pressure / self.pressure_max
+        np.minimum(np.maximum(observation, self.low, out=observation), 1, out=observation)
+        self.total += observation
+        return self.total / min(self.steps + 1, len(self.window))
+
+    def actuate(self, output: np.ndarray) -> None:
+        """Sets rest lengths and pressure."""
+        # L = L0 - s (L0 - l_min) for s > 0, L0 - s (l_max - L0) otherwise;  p = clip(p + dp, p_min, p_max)
+        command = np.tanh(output[:-1])
+        lengths = self.rest - command * np.where(command > 0, self.shorten, self.lengthen)
+        for spring, length in zip(self.springs, lengths.tolist(), strict=True):
+            spring.length = length
+        pressure = self.pressure + self.pressure_step * float(output[-1])
+        self.pressure = min(max(pressure, self.pressure_min), self.pressure_max)
+
+    def push(self, position: np.ndarray) -> None:
+        """Applies the gas's force to every mass."""
+        # its two edges together: p/2 (d_y, -d_x), d from the mass before to the mass after
+        d = position.take(self.after, axis=1) - position.take(self.before, axis=1)
+        down, right = (self.pressure / 2 * d).tolist()
+        for mass, fx, fy in zip(self.masses, right, down, strict=True):
+            mass.ApplyForceToCenter((fx, -fy), True)
+
+
+def check_task(task: Task) -> None:
+    """Raises `ValueError` for a task that this program does not cover."""
+    alike = ("dt", "gravity", "velocity_iterations", "position_iterations", "temperature", "pressure_max", "pressure_min")
+    fixed = {name: getattr(Physics(), name) for name in Physics.__struct_fields__ if name not in alike}
+    if any(getattr(task.physics, name) != value for name, value in fixed.items()):
+        raise ValueError("expected the `paper` preset: Box2D's own numbers cannot be changed")
+    if task.condition != "pressure" or task.body.chamber_count != 1 or task.end is not None:
+        raise ValueError("expected one chamber under control, and a task without an end")
+    if len(task.body.chambers[0]) != task.body.mass_count or task.sensing.observation != "signed":
+        raise ValueError("expected all masses around the chamber, and signed observations")
+
+
+def make_world(task: Task, touches: Touches) -> Any:
+    """A world with the task's ground: an edge for every segment."""
+    world = Box2D.b2World(gravity=(0, -task.physics.gravity), doSleep=False, contactListener=touches)
+    world.continuousPhysics, world.warmStarting = False, True
+    ground = world.CreateStaticBody()
+    for x1, y1, x2, y2 in task.scene.segments.tolist():
+        edge = Box2D.b2EdgeShape(vertices=[(x1, y1), (x2, y2)])
+        ground.CreateFixture(shape=edge, friction=task.scene.friction, restitution=0)
+    return world
+
+
+def add_masses(world: Any, task: Task) -> list[Any]:
+    """The squares: turned by their angle, and never further."""
+    body, masses = task.body, []
+    for i, position in enumerate(task.position.tolist()):
+        mass = world.CreateDynamicBody(position=position, angle=float(body.angle[i]), fixedRotation=True, userData=i)
+        half, density = float(body.side[i]) / 2, float(body.density[i])
+        square = Box2D.b2PolygonShape(box=(half, half))
+        mass.CreateFixture(shape=square, density=density, friction=body.friction, restitution=0)
+        masses.append(mass)
+    return masses
+
+
+def add_springs(world: Any, task: Task, masses: list[Any]) -> list[Any]:
+    """The springs; what one joins does not collide."""
+    body, springs = task.body, []
+    for s, (i, j) in enumerate(body.springs.tolist()):
+        spring = world.CreateDistanceJoint(
+            bodyA=masses[i],
+            bodyB=masses[j],
+            anchorA=masses[i].worldCenter,
+            anchorB=masses[j].worldCenter,
+            length=float(body.rest_length[s]),
+            frequencyHz=float(body.frequency[s]),
+            dampingRatio=float(body.damping_ratio[s]),
+            collideConnected=False,
+        )
+        springs.append(spring)
+    return springs
+
+
+def rollout(task: Task, theta: np.ndarray) -> float:
+    """Mean speed of the centre of mass [m/s] of one agent over the whole task."""
+    agent = Agent(task, theta)
+    start = agent.read()[0] @ agent.share
+    for _ in range(task.steps):
+        agent.step()
+    return float(agent.read()[0] @ agent.share - start) / task.duration
+
+
+def trajectory(task: Task, theta: np.ndarray, steps: int) -> np.ndarray:
+    """Positions [m], shape [step + 1, mass, 2], over the first `steps` steps."""
+    agent = Agent(task, theta)
+    positions = [agent.read()[:2].T]
+    for _ in range(steps):
+        agent.step()
+        positions.append(agent.read()[:2].T)
+    return np.array(positions)
+
+
+if __name__ == "__main__":
+    _task = make_task("hilly", body=sys.argv[1] if len(sys.argv) > 1 else "large")
+    _theta = np.random.default_rng(0).uniform(-1, 1, _task.parameter_count)
+    _began = time.perf_counter()
+    _speed = rollout(_task, _theta)
+    _rate = _task.steps / (time.perf_counter() - _began)
+    print(f"{_rate:,.0f} agent-steps/s, one agent on one core; it moved at {_speed:.3f} m/s")
