@@ -62,7 +62,9 @@ class Agent:
         self.share = body.mass / body.mass.sum()
 
         # observations: touch, x of all, y of all, velocity, pressure; theta has x and y of each mass together
-        order = np.concatenate([np.arange(n), n + 2 * np.arange(n), n + 2 * np.arange(n) + 1, [3 * n, 3 * n + 1, 3 * n + 2]])
+        order = np.concatenate(
+            [np.arange(n), n + 2 * np.arange(n), n + 2 * np.arange(n) + 1, [3 * n, 3 * n + 1, 3 * n + 2]]
+        )
         weight, bias = rows(np.reshape(theta, (1, -1)), body, task.condition)
         self.weight, self.bias = np.ascontiguousarray(weight[0][:, order]), bias[0]
         self.position_scale = task.sensing.position_scale * body.radius
@@ -129,7 +131,15 @@ class Agent:
 
 def check_task(task: Task) -> None:
     """Raises `ValueError` for a task that this program does not cover."""
-    alike = ("dt", "gravity", "velocity_iterations", "position_iterations", "temperature", "pressure_max", "pressure_min")
+    alike = (
+        "dt",
+        "gravity",
+        "velocity_iterations",
+        "position_iterations",
+        "temperature",
+        "pressure_max",
+        "pressure_min",
+    )
     fixed = {name: getattr(Physics(), name) for name in Physics.__struct_fields__ if name not in alike}
     if any(getattr(task.physics, name) != value for name, value in fixed.items()):
         raise ValueError("expected the `paper` preset: Box2D's own numbers cannot be changed")

@@ -25,7 +25,7 @@ class Command(NamedTuple):
     summary: str
     examples: str
     options: Callable[[Parser], None]
-    run: Callable[[argparse.Namespace], None]
+    run: Callable[[argparse.Namespace], int | None]  # exit status; None: 0
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -54,21 +54,18 @@ def _run(argv: list[str]) -> int:
     if name == "--version":
         say(f"turgor {turgor.__version__}")
         return 0
-    if name == "bench":
-        return _bench(rest)
     if name not in COMMANDS:
         if name.startswith("-"):
             raise InvalidInput("expected a command first, as in turgor evolve", name)
-        raise InvalidInput(f"there is no command {name!r}{did_you_mean(name, [*COMMANDS, 'bench'])}")
+        raise InvalidInput(f"there is no command {name!r}{did_you_mean(name, COMMANDS)}")
     command = COMMANDS[name]
     parser = Parser(f"turgor {name}", command.summary, command.examples)
     command.options(parser)
     try:
-        command.run(parser.parse(rest))
+        return command.run(parser.parse(rest)) or 0
     except _Interrupted as end:
         print(f"turgor: interrupted; {end}", file=sys.stderr)
         return INTERRUPTED
-    return 0
 
 
 def _fail(message: str) -> int:
@@ -81,9 +78,7 @@ class _Interrupted(Exception):
 
 
 def _help() -> str:
-    commands = {name: command.summary for name, command in COMMANDS.items()}
-    commands["bench"] = "Measure how fast the engine is on this machine."
-    lines = "\n".join(f"  {name:<10}{summary}" for name, summary in commands.items())
+    lines = "\n".join(f"  {name:<10}{command.summary}" for name, command in COMMANDS.items())
     return f"""usage: turgor COMMAND [options]
 
 Simulates and evolves pressure-based soft agents: bodies of gas inside a ring of masses and springs.
@@ -198,9 +193,13 @@ def _finish(run: Run, options: argparse.Namespace) -> None:
     started = time.perf_counter()
     name, unit, champion = _name(run.task, run.settings.recipe), _unit(run.task), run.checked_champion()
     fitness_figure(run.history, run.path / "fitness.png", unit=unit.strip(), title=name)
+    (run.path / "champion.mp4").unlink(missing_ok=True)  # of a run resumed: an earlier champion's
     if not options.no_video:
         say("drawing champion.mp4 ...")
-        _draw_video(run, run.path / "champion.mp4", (1280, 720))
+        try:
+            _draw_video(run, run.path / "champion.mp4", (1280, 720))
+        except KeyboardInterrupt:
+            raise _Interrupted(f"kept in {run.path}, whole; turgor video {run.path} draws it") from None
     drawing = time.perf_counter() - started
 
     if run.note:
@@ -309,14 +308,16 @@ def _draw_video(run: Run, path: Path, size: tuple[int, int]) -> Path:
     return write_video(recording, path, size=size, title=title)
 
 
-def _bench(argv: list[str]) -> int:
-    import importlib
+def _bench_options(parser: Parser) -> None:
+    from turgor import bench
 
-    try:
-        bench = importlib.import_module("turgor.bench")
-    except ModuleNotFoundError as error:
-        raise InvalidInput("bench: expected an installation with turgor.bench", str(error)) from None
-    return bench.main(argv) or 0
+    bench.add_arguments(parser)
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from turgor import bench
+
+    return bench.run(options)
 
 
 # --- words --------------------------------------------------------------------------------------------------------
@@ -376,5 +377,11 @@ COMMANDS = {
         "  turgor video runs/hilly-small-pressure-s0 --out champion.webm --size 1920x1080",
         _video_options,
         _video,
+    ),
+    "bench": Command(
+        "Measure how fast the engine is on this machine.",
+        "examples:\n  turgor bench --quick\n  turgor bench --csv results.csv",
+        _bench_options,
+        _bench,
     ),
 }

@@ -63,6 +63,7 @@ def check_theta(theta: ArrayLike, body: Body, condition: Condition) -> np.ndarra
         raise InvalidInput(
             "theta: expected finite numbers", f"{array[agent, parameter]} at agent {agent}, parameter {parameter}"
         )
-    if np.abs(array).max(initial=0.0) > 1e15:
-        raise InvalidInput("theta: expected numbers within 1e15", describe(np.abs(array).max()))
+    largest = max(array.max(initial=0.0), -array.min(initial=0.0))  # no temporary array: theta may be large
+    if largest > 1e15:
+        raise InvalidInput("theta: expected numbers within 1e15", describe(largest))
     return array

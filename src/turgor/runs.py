@@ -67,6 +67,15 @@ class Champion(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         return None if self.robust is None else float(np.median(self.robust))
 
 
+class Checkpoint(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+    """A run after one of its generations."""
+
+    generation: int
+    champion: Champion | None = None
+    solver: Champion | None = None
+    state: dict[str, Any] | None = None  # of the strategy; None: before its first generation
+
+
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What run.json holds."""
 
@@ -132,8 +141,9 @@ class Run:
         if (folder / "champion.npz").exists():
             arrays = read_arrays(folder / "champion.npz")
             run.champion = _champion(arrays, "", task, folder / "champion.npz")
-            if "solver_theta" in arrays:
-                run.solver = _champion(arrays, "solver_", task, folder / "champion.npz")
+            run.solver = _champion(arrays, "solver_", task, folder / "champion.npz")
+            if run.champion is None:
+                raise InvalidInput(f"{folder / 'champion.npz'}: expected the arrays of a champion", "no theta")
         return run
 
     @property
@@ -186,22 +196,8 @@ class Run:
     def write_champion(self) -> None:
         """Writes champion.npz."""
         if self.path is not None and self.champion is not None:
-            write_arrays(self.path / "champion.npz", self.champion_arrays())
-
-    def champion_arrays(self) -> dict[str, np.ndarray]:
-        """Champion and solver as arrays."""
-        arrays = {}
-        for prefix, champion in (("", self.champion), ("solver_", self.solver)):
-            if champion is not None:
-                fields = msgspec.structs.asdict(champion)
-                arrays |= {prefix + name: np.asarray(value) for name, value in fields.items() if value is not None}
-        return arrays
-
-    def take_champions(self, arrays: dict[str, np.ndarray], file: str) -> None:
-        """Champion and solver from `champion_arrays`; raises `InvalidInput` that names `file`."""
-        where = Path(file) if self.path is None else self.path / file
-        self.champion = _champion(arrays, "", self.task, where) if "theta" in arrays else None
-        self.solver = _champion(arrays, "solver_", self.task, where) if "solver_theta" in arrays else None
+            arrays = {**_arrays(self.champion, ""), **_arrays(self.solver, "solver_")}
+            write_arrays(self.path / "champion.npz", arrays)
 
     def write_checkpoint(self, state: dict[str, np.ndarray]) -> None:
         """Writes checkpoint.npz: from what `resume` goes on."""
@@ -209,25 +205,34 @@ class Run:
             if self._growing is not None:
                 os.fsync(self._growing.fileno())
             strategy = {f"strategy_{name}": value for name, value in state.items()}
-            numbers = {"generation": np.asarray(self.generation), **self.champion_arrays()}
-            write_arrays(self.path / "checkpoint.npz", {**numbers, **strategy})
+            champions = {**_arrays(self.champion, "champion_"), **_arrays(self.solver, "solver_")}
+            generation = np.asarray(self.generation)
+            write_arrays(self.path / "checkpoint.npz", {"generation": generation, **champions, **strategy})
 
-    def read_checkpoint(self) -> dict[str, np.ndarray] | None:
-        """The strategy's state in checkpoint.npz, with history and champion as they were then; None: there is none.
+    def read_checkpoint(self) -> Checkpoint:
+        """What checkpoint.npz holds; where there is none, the state before the first generation.
 
-        Raises `InvalidInput`."""
+        Raises `InvalidInput`.
+        """
         if self.path is None or not (self.path / "checkpoint.npz").exists():
-            self.champion = self.solver = None
-            self.rewind(0)
-            return None
-        arrays = read_arrays(self.path / "checkpoint.npz")
+            return Checkpoint(generation=0)
+        path = self.path / "checkpoint.npz"
+        arrays = read_arrays(path)
         generation = arrays.get("generation", np.array(-1))
         if generation.shape or not 0 <= generation <= self.generation:
-            expected = f"{self.path / 'checkpoint.npz'}: expected a generation of history.csv, 0 to {self.generation}"
+            expected = f"{path}: expected a generation of history.csv, 0 to {self.generation}"
             raise InvalidInput(expected, describe(generation))
-        self.take_champions(arrays, "checkpoint.npz")
-        self.rewind(int(generation))
-        return {name.removeprefix("strategy_"): a for name, a in arrays.items() if name.startswith("strategy_")}
+        return Checkpoint(
+            generation=int(generation),
+            champion=_champion(arrays, "champion_", self.task, path),
+            solver=_champion(arrays, "solver_", self.task, path),
+            state={name.removeprefix("strategy_"): a for name, a in arrays.items() if name.startswith("strategy_")},
+        )
+
+    def go_back(self, checkpoint: Checkpoint) -> None:
+        """Makes history and champion what they were at `checkpoint`."""
+        self.champion, self.solver = checkpoint.champion, checkpoint.solver
+        self.rewind(checkpoint.generation)
 
     def write_record(self) -> None:
         """Writes run.json."""
@@ -359,21 +364,27 @@ def _read_history(path: Path) -> list[Row]:
     return history
 
 
-def _champion(arrays: dict[str, np.ndarray], prefix: str, task: Task, path: Path) -> Champion:
+def _arrays(champion: Champion | None, prefix: str) -> dict[str, np.ndarray]:
+    fields = {} if champion is None else msgspec.structs.asdict(champion)
+    return {prefix + name: np.asarray(value) for name, value in fields.items() if value is not None}
+
+
+def _champion(arrays: dict[str, np.ndarray], prefix: str, task: Task, path: Path) -> Champion | None:
+    """The inverse of `_arrays`; raises `InvalidInput` that names `path`."""
     fields: dict[str, Any] = {
         name: arrays[prefix + name] for name in Champion.__struct_fields__ if prefix + name in arrays
     }
-    missing = [name for name in ("theta", "fitness", "steps", "solved", "generation") if name not in fields]
-    if missing:
-        raise InvalidInput(f"{path}: expected the arrays of a champion", f"no {prefix}{missing[0]}")
-    theta, count = fields["theta"], task.parameter_count
-    if theta.shape != (count,) or theta.dtype != np.float64:
-        raise InvalidInput(f"{path}: expected theta as float64 [{count}]", f"{theta.dtype} {list(theta.shape)}")
-    for name in ("theta", "fitness"):
-        if fields[name].dtype.kind != "f" or not np.isfinite(fields[name]).all():
-            raise InvalidInput(f"{path}: expected finite numbers in {prefix}{name}", "NaN or infinity")
+    if "theta" not in fields:
+        return None
+    theta, shape = fields["theta"], (task.parameter_count,)
+    if theta.shape != shape or theta.dtype != np.float64:
+        found = f"{theta.dtype} {list(theta.shape)}"
+        raise InvalidInput(f"{path}: expected {prefix}theta as float64 {list(shape)}", found)
     for name in ("fitness", "steps", "solved", "generation"):
-        if fields[name].shape:
-            raise InvalidInput(f"{path}: expected one number in {prefix}{name}", f"shape {list(fields[name].shape)}")
-        fields[name] = fields[name].item()
+        value = fields.get(name, np.zeros(0))
+        if value.shape:
+            raise InvalidInput(f"{path}: expected one number in {prefix}{name}", f"shape {list(value.shape)}")
+        fields[name] = value.item()
+    if not (np.isfinite(theta).all() and np.isfinite(fields["fitness"])):
+        raise InvalidInput(f"{path}: expected finite numbers in {prefix}theta and {prefix}fitness", "NaN or infinity")
     return Champion(**fields)

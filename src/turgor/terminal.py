@@ -53,9 +53,8 @@ class Parser(argparse.ArgumentParser):
         return options
 
     def error(self, message: str) -> Any:
-        raise InvalidInput(
-            message.removeprefix("argument ").replace("the following arguments are required:", "expected")
-        )
+        message = message.replace("the following arguments are required:", f"{self.prog}: expected")
+        raise InvalidInput(message.removeprefix("argument "))
 
     def print_help(self, file: Any = None) -> None:
         say(self.format_help().rstrip())

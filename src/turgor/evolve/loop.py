@@ -113,14 +113,15 @@ def resume(
     optimizer = strategy(run.task.parameter_count, np.random.default_rng(settings.seed))
     if optimizer.name != settings.strategy:
         raise InvalidInput(f"strategy: expected {settings.strategy}", optimizer.name)
-    state = run.read_checkpoint()
-    if state is not None:
-        optimizer.restore(state)
+    checkpoint = run.read_checkpoint()
+    if checkpoint.state is not None:
+        optimizer.restore(checkpoint.state)
     if optimizer.population != settings.population:
         raise InvalidInput(f"strategy: expected a population of {settings.population}", str(optimizer.population))
     run.settings = msgspec.structs.replace(settings, evaluations=budget, threads=simulator.threads)
     run.status, run.note, run.versions = "running", None, current_versions()
     run.write_record()
+    run.go_back(checkpoint)
     return _carry_on(run, simulator, optimizer, progress, started)
 
 
@@ -174,7 +175,7 @@ def _generations(
 ) -> None:
     saved, first = time.perf_counter(), run.evaluations
     with clock.of("start"):
-        simulator.rollout(np.zeros((0, run.task.parameter_count)))  # compiles or loads the engine
+        _load_engine(run.task)
     began = time.perf_counter()
     while run.evaluations < run.settings.evaluations:
         sigma = optimizer.sigma
@@ -194,6 +195,12 @@ def _generations(
         if now - saved > CHECKPOINT_INTERVAL:
             _save(run, optimizer, clock)
             saved = time.perf_counter()
+
+
+def _load_engine(task: Task) -> None:
+    """Compiles the engine or loads it, so that its time is not the first generation's."""
+    task = msgspec.structs.replace(task, fitness="progress")  # a function of the user's own need not take no agents
+    Simulator(task, threads=1).rollout(np.zeros((0, task.parameter_count)))
 
 
 def _note_generation(run: Run, theta: np.ndarray, out: Rollout, sigma: float, seconds: float) -> float:
