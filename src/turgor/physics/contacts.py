@@ -6,7 +6,18 @@ lane of the block has is in the list; in the other lanes its normal is 0, so tha
 contacts are solved in the same order, whatever its neighbours do.
 """
 
-from turgor.physics.lanes import any_lane, fill, inlined, lane_bits, lowest_bit, rare, select, select_mask, stage
+from turgor.physics.lanes import (
+    any_lane,
+    fill,
+    highest,
+    inlined,
+    lane_bits,
+    lowest_bit,
+    rare,
+    select,
+    select_mask,
+    stage,
+)
 from turgor.physics.manifold import (
     NO_ID,
     face_on_segment,
@@ -17,7 +28,7 @@ from turgor.physics.manifold import (
     separation_of_squares,
     square_on_square,
 )
-from turgor.physics.model import MARGIN, NOWHERE
+from turgor.physics.model import LOOK_AGAIN, MARGIN, NOWHERE
 
 FAR_BELOW = -1e9  # [m], where the segment of an empty slot lies
 
@@ -256,16 +267,34 @@ def largest_of(v0, v1, v2, v3):
 def find_pair_contacts(settings, model, state, work):
     """Lists the contacts of two masses and returns their number; renews `touch`."""
     count = 0
+    travel = state.travel[0]
     for p in range(settings.pairs):
+        if travel < state.wake[p]:
+            continue
         a = model.pair_a[p]
         b = model.pair_b[p]
         dx = state.x[b] - state.x[a]
         dy = state.y[b] - state.y[a]
-        if any_lane(max(abs(dx), abs(dy)) < model.pair_reach[p]):
+        nearer = model.pair_reach[p] - max(abs(dx), abs(dy))
+        if any_lane(nearer > 0.0):
             count = add_pair_contact(settings, model, state, work, p, a, b, dx, dy, count)
-        elif state.pair_live[p] != 0:
+        else:
             state.pair_live[p] = 0
+            state.wake[p] = travel - highest(nearer)
     return count
+
+
+@stage
+def note_travel(settings, state, work, t):
+    """How much the distance of any two masses can have changed in step t is added to `travel`."""
+    most = fill(state.x, 0.0)
+    for i in range(settings.masses):
+        most = max(max(abs(work.dx[i]), abs(work.dy[i])), most)
+    state.travel[0] += 2.0 * highest(most)
+    if t % LOOK_AGAIN == 0:
+        state.travel[0] = 0.0
+        for p in range(settings.pairs):
+            state.wake[p] = 0.0
 
 
 @inlined

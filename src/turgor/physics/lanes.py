@@ -230,6 +230,18 @@ def any_lane(typingctx: Any, mask: Any) -> Any:
 
 
 @intrinsic
+def highest(typingctx: Any, value: Any) -> Any:
+    """The largest number of all lanes: one float32. Only for decisions that no lane's result depends on."""
+
+    def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        kind = ir.FunctionType(ir.FloatType(), [value.llvm])
+        name = f"llvm.vector.reduce.fmax.v{value.width}f32"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), values)
+
+    return types.float32(value), emit
+
+
+@intrinsic
 def lane_bits(typingctx: Any, mask: Any) -> Any:
     """`mask` as an int64 whose bit l is lane l (widths up to 32)."""
 

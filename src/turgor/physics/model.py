@@ -19,6 +19,7 @@ from turgor.task import Leave, Task
 
 WIDTH = 16  # agents in a block: one AVX-512 vector; see ARCHITECTURE.md
 NOWHERE = -1
+LOOK_AGAIN = 64  # [step], after which all pairs are looked at, so that `travel` gathers no rounding errors
 # [m], slack of the search for candidates over the exact tests, against rounding. A candidate search that misses a
 # contact shows as an agent that depends on its neighbours: shapes are apart when they are `2 skin` apart along the
 # normal of any face, so that corners can be sqrt(2) times as far away.
@@ -164,6 +165,9 @@ class State(NamedTuple):
     ground_tangent0: Annotated[Floats, "slot"]
     ground_normal1: Annotated[Floats, "slot"]
     ground_tangent1: Annotated[Floats, "slot"]
+    # pairs too far apart to touch are not looked at until the masses have come far enough
+    travel: Annotated[FloatTable, "one"]  # [m], at most this far has any two masses' distance changed in all lanes
+    wake: Annotated[FloatTable, "pair"]  # [m], the travel up to which a pair cannot touch
     # the same for each pair, per unit of effective mass
     pair_live: Annotated[IntTable, "pair"]
     pair_id0: Annotated[Floats, "pair"]

@@ -5,7 +5,7 @@ from functools import partial
 from numba import njit
 
 from turgor.physics.actuate import actuate, control, take_commands, take_lengths
-from turgor.physics.contacts import find_ground_contacts, find_pair_contacts
+from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, note_travel
 from turgor.physics.lanes import any_lane, lane_count, rare, select, stage, views
 from turgor.physics.model import (
     COMMANDS,
@@ -47,6 +47,7 @@ def step(settings, model, state, work, brain, script, drive, t, row):
     solve_velocities(settings, model, state, work, grounds, pairs)
     integrate(settings, state, work)
     correct_positions(settings, model, state, work, grounds, pairs)
+    note_travel(settings, state, work, t)
 
     sense(settings, model, state, work, t + 1)
 
@@ -82,6 +83,8 @@ def begin(settings, model, state, work, result, position, velocity, first, width
             state.segment[slot, lane] = NOWHERE
     for p in range(settings.pairs):
         state.pair_live[p] = 0
+        state.wake[p] = 0.0
+    state.travel[0] = 0.0
     result.steps[0] = 0.0
     result.solved[0] = 0.0
     sense(settings, model, state, work, 0)
