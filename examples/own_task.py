@@ -6,8 +6,9 @@ import turgor
 from turgor.scene import polyline
 
 # two hexagons of gas that share an edge: masses, springs and chambers are lists, a ring is one body among others
-left = 4.0 * np.array([[np.cos(a), np.sin(a)] for a in np.pi / 3 * (np.arange(6) + 0.5)]) - [4.0 * np.cos(np.pi / 6), 0]
-right = left + [8.0 * np.cos(np.pi / 6), 0]
+corner = np.pi / 3 * (np.arange(6) + 0.5)
+hexagon = 4.0 * np.stack([np.cos(corner), np.sin(corner)], axis=1)
+left, right = hexagon - [hexagon[0, 0], 0], hexagon + [hexagon[0, 0], 0]
 position = np.concatenate([left, right[[0, 1, 4, 5]]])  # masses 0 and 5 are shared
 chambers = [[0, 1, 2, 3, 4, 5], [6, 7, 0, 5, 8, 9]]
 springs = sorted({tuple(sorted((loop[i - 1], loop[i]))) for loop in chambers for i in range(6)})
@@ -28,4 +29,6 @@ task = turgor.Task(
     name="step", body=body, scene=scene, position=turgor.resting(body), steps=600, fitness=fitness, end=climbed
 )
 run = turgor.evolve(task, evaluations=200, seed=1)
-print(f"{task.parameter_count} parameters, best fitness {run.champion.fitness:.2f}, robust {run.champion.robust:.2f}")
+print(
+    f"{task.parameter_count} parameters, best fitness {run.champion.fitness:.2f}, robust {run.champion.robust_fitness:.2f}"
+)

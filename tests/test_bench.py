@@ -31,7 +31,7 @@ TINY = bench.Plan(
     peer_batch=20,
 )
 COLUMNS = [
-    *("machine", "cpu", "date", "turgor", "python", "numba"),
+    *("machine", "cpu", "date", "turgor", "python", "numba", "other_load"),
     *("name", "body", "task", "controllers", "batch", "threads", "value", "unit", "what"),
 ]
 
@@ -125,7 +125,7 @@ def test_command_writes_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         table = list(csv.DictReader(file))
     whole = json.loads((tmp_path / "rows.json").read_text(encoding="utf-8"))
     assert list(table[0]) == COLUMNS
-    assert [*whole, *whole["rows"][0]] == [*COLUMNS[:6], "rows", *COLUMNS[6:]]
+    assert [*whole, *whole["rows"][0]] == [*COLUMNS[:7], "rows", *COLUMNS[7:]]
     assert [float(row["value"]) for row in table] == pytest.approx([r["value"] for r in whole["rows"]], rel=1e-3)
     printed = capsys.readouterr()
     assert len(printed.out.splitlines()) == len(table) + 2  # a title and the columns' names

@@ -19,7 +19,7 @@ import pytest
 
 from turgor.body import SIZES
 from turgor.cli import COMMANDS, main
-from turgor.evolve.loop import evolve
+from turgor.evolution.loop import evolve
 from turgor.runs import Run
 from turgor.simulate import Simulator
 from turgor.task import TASKS, make_task, variant_names

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from turgor.errors import InvalidInput
-from turgor.evolve.loop import evolve, resume
+from turgor.evolution.loop import evolve, resume
 from turgor.runs import COLUMNS, Run, free_folder, read_arrays, write_arrays, write_whole
 from turgor.task import Task, make_task
 

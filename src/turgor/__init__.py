@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from turgor.body import ring as ring
     from turgor.control import Sensing as Sensing
     from turgor.errors import InvalidInput as InvalidInput
-    from turgor.evolve.loop import evolve as evolve
-    from turgor.evolve.strategy import CMAES as CMAES
-    from turgor.evolve.strategy import Strategy as Strategy
+    from turgor.evolution.loop import evaluate as evaluate
+    from turgor.evolution.loop import evolve as evolve
+    from turgor.evolution.loop import resume as resume
+    from turgor.evolution.strategy import CMAES as CMAES
+    from turgor.evolution.strategy import Strategy as Strategy
     from turgor.recording import Recording as Recording
     from turgor.runs import Run as Run
     from turgor.scene import Scene as Scene
@@ -44,8 +46,8 @@ _HOME = {
     "turgor.body": ("Body", "LARGE", "MEDIUM", "SMALL", "ring"),
     "turgor.control": ("Sensing",),
     "turgor.errors": ("InvalidInput",),
-    "turgor.evolve.loop": ("evolve",),
-    "turgor.evolve.strategy": ("CMAES", "Strategy"),
+    "turgor.evolution.loop": ("evaluate", "evolve", "resume"),
+    "turgor.evolution.strategy": ("CMAES", "Strategy"),
     "turgor.recording": ("Recording",),
     "turgor.runs": ("Run",),
     "turgor.scene": ("Scene", "cage", "flat", "hills"),

@@ -132,7 +132,7 @@ def evolved(task: Any, generations: int) -> tuple[Any, Any, list[Any]]:
     """The champion of a short CMA-ES run, its strategy, whose draws are the population around it, and no draws yet."""
     import numpy as np
 
-    from turgor.evolve.strategy import CMAES
+    from turgor.evolution.strategy import CMAES
     from turgor.simulate import Simulator
 
     say(f"evolving controllers: {task.name}, {task.body.mass_count} masses, {generations} generations")
@@ -411,7 +411,11 @@ def run(namespace: argparse.Namespace) -> int:
         print(f"turgor bench: {error}", file=sys.stderr)
         return 2
     rows: list[Row] = []
+    began, busy, own = time.perf_counter(), machine_seconds(), own_seconds()
     status = measure(names, QUICK if namespace.quick else Plan(), rows)
+    if busy is not None:
+        other = (machine_seconds() or 0) - busy - (own_seconds() - own)
+        here["other_load"] = f"{max(other / (time.perf_counter() - began), 0):.2f}"
     if rows:
         show(rows, here)
         writers = {"csv": as_csv, "json": as_json}
@@ -456,7 +460,7 @@ def target(path: str | None, kind: str, machine: str) -> Path | None:
 
 
 def environment() -> dict[str, str]:
-    """What every row depends on: the machine by its processor, the day, the versions."""
+    """What every row depends on: the machine by its processor, the day, the versions, other programs' load (later)."""
     from importlib.metadata import version
 
     from llvmlite.binding import get_host_cpu_name
@@ -474,7 +478,23 @@ def environment() -> dict[str, str]:
         "turgor": __version__,
         "python": ".".join(map(str, sys.version_info[:3])),
         "numba": version("numba"),
+        "other_load": "",
     }
+
+
+def machine_seconds() -> float | None:
+    """Core-seconds that the whole machine has worked since it started; None where that is not told."""
+    try:
+        with open("/proc/stat", encoding="ascii") as file:
+            user, nice, system, _, _, irq, soft, steal = map(int, file.readline().split()[1:9])
+    except (OSError, ValueError):
+        return None
+    return (user + nice + system + irq + soft + steal) / os.sysconf("SC_CLK_TCK")
+
+
+def own_seconds() -> float:
+    """Core-seconds that this process and the ended ones that it started have worked."""
+    return sum(os.times()[:4])
 
 
 def cells(row: Row) -> list[str]:
@@ -486,6 +506,8 @@ def cells(row: Row) -> list[str]:
 def show(rows: Sequence[Row], here: dict[str, str]) -> None:
     """Prints the rows: a table on a terminal, aligned plain lines elsewhere."""
     title = f"{here['cpu']}; turgor {here['turgor']}, Python {here['python']}, Numba {here['numba']}; {here['date']}"
+    if here["other_load"]:
+        title += f"; other programs kept {here['other_load']} of {os.cpu_count()} cores busy"
     names = Row.__struct_fields__
     lines = [cells(row) for row in rows]
     if sys.stdout.isatty():

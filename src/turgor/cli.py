@@ -139,7 +139,7 @@ def _evolve(options: argparse.Namespace) -> None:
     chosen = {name: getattr(options, name) for name in variant_names()}
     variants = {name: value for name, value in chosen.items() if value is not None}
     task = make_task(options.task, body=options.body, condition=options.condition, seed=options.seed, **variants)
-    from turgor.evolve.loop import evolve
+    from turgor.evolution.loop import evolve
     from turgor.runs import free_folder
 
     out = options.out or free_folder(f"{task.name}-{options.body}-{task.condition}-s{options.seed}")
@@ -158,7 +158,7 @@ def _evolve(options: argparse.Namespace) -> None:
 
 
 def _resume(options: argparse.Namespace) -> None:
-    from turgor.evolve.loop import resume
+    from turgor.evolution.loop import resume
     from turgor.runs import Run, current_versions
 
     run = Run.open(options.run)
@@ -234,7 +234,7 @@ def _evaluate_options(parser: Parser) -> None:
 def _evaluate(options: argparse.Namespace) -> None:
     import numpy as np
 
-    from turgor.evolve.loop import evaluate
+    from turgor.evolution.loop import evaluate
     from turgor.runs import Run, write_whole
     from turgor.simulate import Simulator
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_h
 from turgor.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from turgor.evolve.loop import Progress
+    from turgor.evolution.loop import Progress
 
 LINE_INTERVAL = 2.0  # [s], between lines of progress in a pipe
 LIVE_INTERVAL = 0.1  # [s], between redraws on a terminal

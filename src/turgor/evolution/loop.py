@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from turgor.errors import InvalidInput, describe
-from turgor.evolve.strategy import CMAES, Degenerate, Strategy
+from turgor.evolution.strategy import CMAES, Degenerate, Strategy
 from turgor.runs import Champion, Run, Settings, current_versions
 from turgor.simulate import Rollout, Simulator, perturbed
 from turgor.task import Task

@@ -1,0 +1,1 @@
+"""Evolution: strategies that propose controllers, and the loop that has them simulated."""
