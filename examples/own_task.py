@@ -29,6 +29,4 @@ task = turgor.Task(
     name="step", body=body, scene=scene, position=turgor.resting(body), steps=600, fitness=fitness, end=climbed
 )
 run = turgor.evolve(task, evaluations=200, seed=1)
-print(
-    f"{task.parameter_count} parameters, best fitness {run.champion.fitness:.2f}, robust {run.champion.robust_fitness:.2f}"
-)
+print(f"{task.parameter_count} parameters; best {run.champion.fitness:.2f}, robust {run.champion.robust_fitness:.2f}")

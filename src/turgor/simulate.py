@@ -21,7 +21,7 @@ from turgor import physics
 from turgor.body import Body
 from turgor.control import check_theta, observation_count, output_count, rows
 from turgor.errors import InvalidInput, describe
-from turgor.physics.lanes import Width, aligned
+from turgor.physics.lanes import LINE, Width, aligned
 from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH, Brain, Kernel, Result, State, Work, make_kernel
 from turgor.physics.step import run_blocks
 from turgor.recording import Recording
@@ -148,7 +148,7 @@ class Simulator:
         for t in range(task.steps):
             rows_of_t = None if script is None else script[t : t + 1]
             # a trace of two rows: before and after this step
-            here = None if trace is None else np.zeros_like(trace[:2])
+            here = None if trace is None else batch.trace(1)
             batch.run(drive, first=t, steps=1, last=task.steps - 1, script=rows_of_t, trace=here)
             if trace is not None and here is not None:
                 trace[t + 1] = here[1]
@@ -294,6 +294,10 @@ class _Batch:
                 scripts[0] = np.repeat(script.ravel(), WIDTH)
         traces = np.zeros((1, 0), np.float32) if trace is None else trace.reshape(1, -1)
         kernel = self.kernel
+        # the kernel's loads and stores are of whole cache lines
+        assert all(
+            a.ctypes.data % LINE == 0 or a.size == 0 for a in (self.memory, self.brains, self.results, scripts, traces)
+        )
         run_blocks(
             _width(), kernel.settings, kernel.tables, self.memory, self.brains, scripts, traces, self.results,
             kernel.layouts, self.position, self.velocity, drive, first, steps, last,
