@@ -6,6 +6,8 @@ lane of the block has is in the list; in the other lanes its normal is 0, so tha
 contacts are solved in the same order, whatever its neighbours do.
 """
 
+import numpy as np
+
 from turgor.physics.lanes import (
     any_lane,
     fill,
@@ -36,7 +38,7 @@ FAR_BELOW = -1e9  # [m], where the segment of an empty slot lies
 @stage
 def find_ground_contacts(settings, model, state, work):
     """Lists the contacts with the scene and returns their number; renews `touch`."""
-    count = 0
+    count = np.int64(0)  # not a literal, for which Numba would compile what takes it twice
     for i in range(settings.masses):
         state.touch[i] = fill(state.x, 0.0)
         x = state.x[i]
@@ -266,7 +268,7 @@ def largest_of(v0, v1, v2, v3):
 @stage
 def find_pair_contacts(settings, model, state, work):
     """Lists the contacts of two masses and returns their number; renews `touch`."""
-    count = 0
+    count = np.int64(0)
     travel = state.travel[0]
     for p in range(settings.pairs):
         if travel < state.wake[p]:

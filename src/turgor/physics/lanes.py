@@ -51,8 +51,9 @@ def intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # One of these above every function of the kernel. No fast-math: see above.
-stage = njit(error_model="numpy", boundscheck=False, forceinline=True)
-rare = njit(error_model="numpy", boundscheck=False)
+_options = {"error_model": "numpy", "boundscheck": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+stage = njit(forceinline=True, **_options)
+rare = njit(**_options)
 inlined = stage
 
 # --- values -------------------------------------------------------------------------------------------------------

@@ -53,9 +53,9 @@ def step(settings, model, state, work, brain, script, drive, t, row):
 
 
 @rare
-def begin(settings, model, state, work, result, position, velocity, first, width):
+def begin(settings, model, state, work, result, position, velocity, first, width, t):
     """Puts agents `first` ... of `position` [agent, mass, 2] into the lanes, at rest lengths and without a past, and
-    makes their first observation."""
+    makes their first observation, at t = 0."""
     for i in range(settings.masses):
         for lane in range(lane_count(width)):
             state.x[i, lane] = position[first + lane, i, 0]
@@ -87,7 +87,7 @@ def begin(settings, model, state, work, result, position, velocity, first, width
     state.travel[0] = 0.0
     result.steps[0] = 0.0
     result.solved[0] = 0.0
-    sense(settings, model, state, work, 0)
+    sense(settings, model, state, work, t)
 
 
 @stage
@@ -153,9 +153,11 @@ def _run_blocks(
         script = views(Script, scripts[0], layouts[5], width)
         trace = views(Trace, traces[0], layouts[5], width)
         if first_step == 0:
-            begin(settings, model, state, work, result, position, velocity, block * lane_count(width), width)
+            begin(
+                settings, model, state, work, result, position, velocity, block * lane_count(width), width, first_step
+            )
             if recording:
-                record(settings, state, work, trace, 0)
+                record(settings, state, work, trace, first_step)
         for k in range(steps):
             t = first_step + k
             step(settings, model, state, work, brain, script, drive, t, k)
