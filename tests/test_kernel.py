@@ -19,8 +19,9 @@ from turgor.body import Body, ring
 from turgor.control import rows
 from turgor.physics import reference
 from turgor.physics.actuate import tanh
-from turgor.physics.lanes import Floats, Width, aligned, field_of, layout, views
-from turgor.physics.model import COMMANDS, CONTROLLER, WIDTH, Model, State, make_kernel
+from turgor.physics.memory import Floats, Width, aligned, field_of, layout, views
+from turgor.physics.model import COMMANDS, CONTROLLER, WIDTH, Model, State
+from turgor.physics.tables import make_kernel
 from turgor.scene import GROUND_DEPTH, Scene
 from turgor.simulate import Simulator, _Batch, replay
 from turgor.task import Physics, Task, make_task

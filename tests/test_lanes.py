@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numba import njit, typeof
 
-from turgor.physics.lanes import (
+from turgor.physics.lanes import any_lane, lane_bits, lowest_bit, select, select_mask
+from turgor.physics.memory import (
     BYTES,
     FIELD,
     LINE,
@@ -19,16 +20,11 @@ from turgor.physics.lanes import (
     IntTable,
     Width,
     aligned,
-    any_lane,
     field_of,
     fields,
     fill,
-    lane_bits,
     lane_count,
     layout,
-    lowest_bit,
-    select,
-    select_mask,
     views,
 )
 

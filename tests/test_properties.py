@@ -30,23 +30,28 @@ def number(low: float, high: float) -> st.SearchStrategy[float]:
 
 
 @st.composite
-def rings(draw: st.DrawFn, strongest: float = 3.0) -> Body:
-    """Rings of 3 to 24 masses that stand clear of each other, with gas for up to `strongest` times the pressure that
-    carries them."""
+def rings(draw: st.DrawFn, *, bursting: bool = False) -> Body:
+    """Rings of 3 to 24 masses that stand clear of each other, with gas for up to three times the pressure that
+    carries them, but no more than their springs hold; with up to fifty times of it if `bursting`."""
     count = draw(st.integers(3, 24))
     side = draw(number(0.3, 1.5))
     radius = max(draw(number(1, 12)), side / np.sin(np.pi / count))
     density = draw(number(500, 5000))
-    weight = count * density * side**2 * 10
-    # p_max = 1.25 nRT / (pi r^2)
-    most = strongest * weight / (2 * radius) * np.pi * radius**2 / (1.25 * 8.314 * 288.15)
+    frequency = draw(number(2, 10))
+    mass = density * side**2
+    carrying = count * mass * 10 / (2 * radius)
+    # R = r / (1 - p cot(π/n) / (2 k)), k = m/2 ω²: at most 1.4 r
+    holding = 0.3 * mass * (2 * np.pi * frequency) ** 2 * np.tan(np.pi / count)
+    most = 50 * carrying if bursting else min(3 * carrying, holding)
+    # p_max = 1.25 nRT / (π r²)
+    amount = most * np.pi * radius**2 / (1.25 * 8.314 * 288.15)
     return ring(
         count,
         radius,
-        gas_amount=draw(st.sampled_from([0, 0.01, 0.3, 1])) * most,
+        gas_amount=draw(st.sampled_from([0, 0.01, 0.3, 1])) * amount,
         side=side,
         density=density,
-        frequency=draw(number(2, 10)),
+        frequency=frequency,
         damping_ratio=draw(number(0, 1)),
         friction=draw(number(0, 20)),
     )
@@ -126,7 +131,7 @@ def ground_under(scene: Scene, x: np.ndarray) -> np.ndarray:
 
 
 @quick
-@given(body=st.one_of(rings(50.0), heaps()), scene=scenes(), seed=st.integers(0, 99), data=st.data())
+@given(body=st.one_of(rings(bursting=True), heaps()), scene=scenes(), seed=st.integers(0, 99), data=st.data())
 def test_states_stay_finite(body: Body, scene: Scene, seed: int, data: st.DataObject) -> None:
     """Huge controllers, overlapping masses, fifty times the gas: never NaN, and never faster than the limit."""
     task = task_of(body, scene, data.draw(number(-3, 10)))
@@ -148,7 +153,9 @@ def test_states_stay_finite(body: Body, scene: Scene, seed: int, data: st.DataOb
 @quick
 @given(body=rings(), seed=st.integers(0, 99), data=st.data())
 def test_rings_stay_above_the_ground(body: Body, seed: int, data: st.DataObject) -> None:
-    """No mass's centre is ever below the ground line by more than half a metre, nor beyond a terrain's end walls."""
+    """No mass's centre is ever below the ground line (by more than 0.1 m), nor beyond a terrain's end walls, unless it moves by
+    more than half its side in a step: there is no continuous collision. Ground brings back even those within 5 steps.
+    """
     scene = data.draw(st.sampled_from([flat(), None])) or hills_of(data.draw, 0.2)
     height = 0.1 + ground_under(scene, np.linspace(-14, 14, 400)).max()
     half_extent = np.abs(scene.segments[:, [0, 2]]).max()
@@ -157,8 +164,13 @@ def test_rings_stay_above_the_ground(body: Body, seed: int, data: st.DataObject)
         return  # it does not fit between the walls
     for theta in thetas(task, 2, seed, 3.0):
         position = Simulator(task, threads=1).record(theta).position
-        assert (position[..., 1] - ground_under(scene, position[..., 0])).min() > -0.5
-        assert np.abs(position[..., 0]).max() < half_extent
+        fastest = np.linalg.norm(np.diff(position, axis=0), axis=-1).max()
+        above = position[..., 1] - ground_under(scene, position[..., 0])
+        if fastest < body.side.min() / 2:
+            assert above.min() > -0.1
+            assert np.abs(position[..., 0]).max() < half_extent
+        elif scene.segments.shape[0] == 1:
+            assert not any((above[k : k + 6] < -0.5).all(axis=0).any() for k in range(295))
 
 
 @quick

@@ -16,17 +16,9 @@ from turgor.body import GAS_CONSTANT, Body
 from turgor.errors import InvalidInput
 from turgor.recording import Recording
 from turgor.scene import Scene, highest_ground
-from turgor.view.draw import (
-    PRESSURE_MAP,
-    SOLID,
-    STRAIN_MAP,
-    Painter,
-    closed_loops,
-    draw_frame,
-    span,
-    wall_shapes,
-)
+from turgor.view.draw import Painter, draw_frame
 from turgor.view.figures import fitness_figure
+from turgor.view.shapes import PRESSURE_MAP, SOLID, STRAIN_MAP, closed_loops, span, wall_shapes
 from turgor.view.video import frame_steps, write_video
 
 

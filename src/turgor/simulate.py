@@ -21,9 +21,10 @@ from turgor import physics
 from turgor.body import Body
 from turgor.control import check_theta, observation_count, output_count, rows
 from turgor.errors import InvalidInput, describe
-from turgor.physics.lanes import LINE, Width, aligned
-from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH, Brain, Kernel, Result, State, Work, make_kernel
+from turgor.physics.memory import LINE, Width, aligned
+from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH, Brain, Result, State, Work
 from turgor.physics.step import run_blocks
+from turgor.physics.tables import Kernel, make_kernel
 from turgor.recording import Recording
 from turgor.scene import LARGEST_COORDINATE, Scene
 from turgor.task import Physics, Task, given_rows, start_position

@@ -1,6 +1,7 @@
 """Control and actuation: commands from the controller, rest lengths and pressures from commands."""
 
-from turgor.physics.lanes import fill, inlined, select, stage
+from turgor.physics.lanes import inlined, select, stage
+from turgor.physics.memory import fill
 from turgor.physics.model import CONTROLLED
 from turgor.physics.sense import clamp
 

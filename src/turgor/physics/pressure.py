@@ -2,7 +2,8 @@
 
 import math
 
-from turgor.physics.lanes import fill, stage
+from turgor.physics.lanes import stage
+from turgor.physics.memory import fill
 from turgor.physics.model import GAS_LAW, NOWHERE
 
 

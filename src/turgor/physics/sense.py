@@ -1,6 +1,7 @@
 """Sensing: the present observation is pushed into the window, whose mean the controller sees."""
 
-from turgor.physics.lanes import fill, inlined, rare, stage
+from turgor.physics.lanes import inlined, rare, stage
+from turgor.physics.memory import fill
 
 
 @inlined

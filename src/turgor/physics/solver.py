@@ -11,7 +11,8 @@ cannot turn: velocities use the first, positions both.
 
 import math
 
-from turgor.physics.lanes import any_lane, fill, inlined, select, stage
+from turgor.physics.lanes import any_lane, inlined, select, stage
+from turgor.physics.memory import fill
 from turgor.physics.sense import clamp
 from turgor.physics.springs import solve_springs
 

@@ -12,7 +12,8 @@ addition, and the rest need not wait:
 
 import math
 
-from turgor.physics.lanes import fill, select, stage
+from turgor.physics.lanes import select, stage
+from turgor.physics.memory import fill
 
 SLOP = 0.005  # [m], a shorter spring has no direction
 

@@ -6,7 +6,8 @@ from numba import njit
 
 from turgor.physics.actuate import actuate, control, take_commands, take_lengths
 from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, note_travel
-from turgor.physics.lanes import any_lane, lane_count, rare, select, stage, views
+from turgor.physics.lanes import any_lane, rare, select, stage
+from turgor.physics.memory import lane_count, views
 from turgor.physics.model import (
     COMMANDS,
     CONTROLLER,

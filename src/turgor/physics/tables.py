@@ -1,0 +1,277 @@
+"""A task as the kernel sees it: settings, tables, and the layout of its memory."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from turgor.body import Body
+from turgor.control import observation_count, output_count
+from turgor.physics.memory import aligned, field_of, fields, layout
+from turgor.physics.model import (
+    CONTROLLED,
+    GAS_LAW,
+    GIVEN,
+    MARGIN,
+    NOWHERE,
+    VIEWS,
+    WIDTH,
+    Model,
+    Settings,
+    State,
+    Work,
+)
+from turgor.scene import Scene
+from turgor.task import Leave, Task
+
+
+class Kernel(NamedTuple):
+    """A task as the kernel sees it, in Python: settings, tables, and the layout of a block's memory."""
+
+    settings: Settings
+    tables: np.ndarray  # float32 [size]
+    layouts: np.ndarray  # offsets of the fields of VIEWS and where each ends, [view, field]
+    lengths: dict[str, int]
+
+    def field(self, buffer: np.ndarray, view: type, name: str) -> np.ndarray:
+        """A field of a `view` in one block's `buffer`, writable: [length, lane], or [length] for tables."""
+        width = 1 if view is Model else WIDTH
+        return field_of(buffer, view, self.layouts[VIEWS.index(view)], name, self.lengths, width)
+
+    def size(self, view: type) -> int:
+        """Numbers in one block's buffer for a `view`; State and Work, behind it, share one."""
+        last = Work if view is State else view
+        return int(self.layouts[VIEWS.index(last), len(fields(last))])
+
+
+def make_kernel(task: Task) -> Kernel:
+    """The `Kernel` of a task."""
+    body, physics = task.body, task.physics
+    tables: dict[str, np.ndarray] = {}
+    tables |= _mass_tables(body)
+    tables |= _spring_tables(body, physics.dt)
+    tables |= _chamber_tables(task)
+    tables |= _scene_tables(task.scene, _margin(body, physics.skin))
+    tables |= _pair_tables(body, physics.skin)
+    slots = tables.pop("slots").item()
+    lengths = {
+        "mass": body.mass_count,
+        "spring": body.spring_count,
+        "chain": len(tables["chain_start"]),
+        "chamber": body.chamber_count,
+        "chamber_end": body.chamber_count + 1,
+        "edge": len(tables["edge_from"]),
+        "segment": len(task.scene.segments),
+        "column": len(tables["floor"]),
+        "column_end": len(tables["floor"]) + 1,
+        "candidate": len(tables["candidate"]),
+        "pair": len(tables["pair_a"]),
+        "slot": body.mass_count * slots,
+        "input": observation_count(body),
+        "output": output_count(body, task.condition),
+        "one": 1,
+        "script": 0,  # seen from the start of a buffer of its own
+        "trace": 0,
+        "window": observation_count(body) * task.sensing.window,
+        "weight": observation_count(body) * output_count(body, task.condition),
+    }
+    layouts = _layouts(lengths)
+    buffer = aligned(1, layouts[0, len(fields(Model))])[0]
+    settings = Settings(
+        lanes=np.int32(WIDTH),
+        masses=np.int32(body.mass_count),
+        springs=np.int32(body.spring_count),
+        chambers=np.int32(body.chamber_count),
+        inputs=np.int32(lengths["input"]),
+        outputs=np.int32(lengths["output"]),
+        chains=np.int32(lengths["chain"] - 1),
+        pairs=np.int32(lengths["pair"]),
+        columns=np.int32(lengths["column"]),
+        slots=np.int32(slots),
+        window=np.int32(task.sensing.window),
+        unit_observation=np.int32(task.sensing.observation == "unit"),
+        pressure_source=np.int32(_pressure_source(task)),
+        commanded_length=np.int32(physics.pressure_length == "commanded"),
+        leaves=np.int32(isinstance(task.end, Leave)),
+        velocity_iterations=np.int32(physics.velocity_iterations),
+        position_iterations=np.int32(physics.position_iterations),
+        dt=np.float32(physics.dt),
+        gravity=np.float32(physics.gravity),
+        slop=np.float32(physics.slop),
+        reach=np.float32(2 * physics.skin),
+        baumgarte=np.float32(physics.baumgarte),
+        max_correction=np.float32(physics.max_correction),
+        max_travel=np.float32(physics.max_travel),
+        ground_friction=np.float32(math.sqrt(body.friction * task.scene.friction)),
+        pair_friction=np.float32(body.friction),
+        position_scale=np.float32(1 / (task.sensing.position_scale * body.radius)) if body.radius else np.float32(0),
+        velocity_scale=np.float32(1 / task.sensing.velocity_scale),
+        half_width=np.float32(task.end.half_width if isinstance(task.end, Leave) else math.inf),
+    )
+    kernel = Kernel(settings, buffer, layouts, lengths)
+    for name, values in tables.items():
+        kernel.field(buffer, Model, name)[:] = values
+    return kernel
+
+
+def _layouts(lengths: dict[str, int]) -> np.ndarray:
+    """Offsets of every view; Work stands behind State in the same buffer."""
+    rows = [layout(view, lengths, 1 if view is Model else WIDTH) for view in VIEWS]
+    rows[VIEWS.index(Work)] += rows[VIEWS.index(State)][-1]
+    table = np.zeros((len(rows), max(len(row) for row in rows)), dtype=np.int64)
+    for k, row in enumerate(rows):
+        table[k, : len(row)] = row
+    return table
+
+
+def _pressure_source(task: Task) -> int:
+    if task.pressure is not None:
+        return GIVEN
+    return CONTROLLED if task.condition == "pressure" else GAS_LAW
+
+
+def _margin(body: Body, skin: float) -> float:
+    """How far from a mass's centre it can meet a segment [m]."""
+    return math.sqrt(2) * (float(body.side.max()) / 2 + 2 * skin) + MARGIN
+
+
+def _mass_tables(body: Body) -> dict[str, np.ndarray]:
+    cosine, sine = np.cos(body.angle), np.sin(body.angle)
+    return {
+        "half": body.side / 2,
+        "cosine": cosine,
+        "sine": sine,
+        "extent": body.side / 2 * (np.abs(cosine) + np.abs(sine)),
+        "inverse_mass": 1 / body.mass,
+        "share": body.mass / body.mass.sum(),
+    }
+
+
+def _spring_tables(body: Body, dt: float) -> dict[str, np.ndarray]:
+    """Box2D's soft distance constraint:  omega = 2 pi f, k = m omega^2, c = 2 m zeta omega,
+    gamma = 1 / (h (c + h k)), bias velocity = C h k gamma, with m the pair's reduced mass."""
+    order = np.arange(body.spring_count)[::-1]
+    tail, head, chain_start = _chains(body.springs[order])
+    inverse = (1 / body.mass)[tail] + (1 / body.mass)[head]
+    omega = 2 * np.pi * body.frequency[order]
+    k = omega**2 / inverse
+    c = 2 * body.damping_ratio[order] * omega / inverse
+    softness = 1 / (dt * (c + dt * k))
+    effective = 1 / (inverse + softness)
+    return {
+        "tail": tail,
+        "head": head,
+        "spring": order,
+        "chain_start": chain_start,
+        "effective_mass": effective,
+        "relaxation": effective * softness,
+        "stiffness": effective * dt * k * softness,
+        "rest": body.rest_length,
+        "shortening": body.rest_length * (1 - body.shortest),
+        "lengthening": body.rest_length * (body.longest - 1),
+    }
+
+
+def _chains(springs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The springs [spring, 2] directed (tail, head) so that as many as possible start where the one before
+    ended, and the starts of such chains. The solver carries a chain's last velocity in registers."""
+    tails, heads, starts = [], [], []
+    for k, (a, b) in enumerate(springs.tolist()):
+        if k and heads[-1] in (a, b):
+            tail, head = (a, b) if heads[-1] == a else (b, a)
+        else:
+            starts.append(k)
+            ahead = springs[k + 1].tolist() if k + 1 < len(springs) else []
+            tail, head = (a, b) if b in ahead else (b, a)
+        tails.append(tail)
+        heads.append(head)
+    return np.array(tails, dtype=np.int64), np.array(heads, dtype=np.int64), np.array([*starts, len(springs)])
+
+
+def _chamber_tables(task: Task) -> dict[str, np.ndarray]:
+    body, low_high = task.body, task.pressure_range
+    between = {frozenset(pair): k for k, pair in enumerate(body.springs.tolist())}
+    edges = [edge for loop in body.chambers for edge in zip(loop, loop[1:] + loop[:1], strict=True)]
+    # a chamber without gas has no p_max to be seen relative to
+    scale = np.divide(1, low_high[:, 1], out=np.zeros(len(low_high)), where=low_high[:, 1] > 0)
+    return {
+        "edge_start": np.cumsum([0, *(len(loop) for loop in body.chambers)]),
+        "edge_from": np.array([a for a, _ in edges]),
+        "edge_to": np.array([b for _, b in edges]),
+        "edge_spring": np.array([between.get(frozenset(edge), NOWHERE) for edge in edges]),
+        "gas_energy": task.gas_energy,
+        "area_floor": task.area_floor,
+        "pressure_start": task.pressure_start,
+        "pressure_min": low_high[:, 0],
+        "pressure_max": low_high[:, 1],
+        "pressure_step": task.pressure_step,
+        "pressure_scale": scale,
+    }
+
+
+def _scene_tables(scene: Scene, margin: float) -> dict[str, np.ndarray]:
+    """Columns are cut wherever the list of segments within `margin` changes, so that each list is exact."""
+    segments, normal = scene.segments, scene.normal
+    low = np.minimum(segments[:, 0], segments[:, 2]) - margin
+    high = np.maximum(segments[:, 0], segments[:, 2]) + margin
+    cuts = np.unique(np.float32(np.concatenate([low, high])))
+    column = np.concatenate([[-np.inf], cuts, [np.inf]])
+    lists = [np.flatnonzero((low < b) & (high > a)) for a, b in pairwise(column)]
+    slots = max([1, *(len(found) for found in lists)])
+    candidate = np.full((len(lists), slots), NOWHERE)
+    floor, ceiling = np.full(len(lists), -np.inf), np.full(len(lists), np.inf)
+    for k, found in enumerate(lists):
+        candidate[k, : len(found)] = found
+        for s in found:
+            bottom, top = _span(segments[s], column[k] - margin, column[k + 1] + margin)
+            if normal[s, 1] <= 0:
+                ceiling[k] = min(ceiling[k], bottom)
+            if normal[s, 1] >= 0:
+                floor[k] = max(floor[k], top)
+    return {
+        "x1": segments[:, 0],
+        "y1": segments[:, 1],
+        "x2": segments[:, 2],
+        "y2": segments[:, 3],
+        "nx": normal[:, 0],
+        "ny": normal[:, 1],
+        "depth": scene.depth,
+        "column": column,
+        "floor": floor,
+        "ceiling": ceiling,
+        "listed": np.array([len(found) for found in lists]),
+        "candidate": candidate.ravel(),
+        "slots": np.array(slots),
+    }
+
+
+def _span(segment: np.ndarray, left: float, right: float) -> tuple[float, float]:
+    """Lowest and highest y of a segment between two x."""
+    x1, y1, x2, y2 = segment
+    if x1 == x2:
+        return min(y1, y2), max(y1, y2)
+    ends = [y1 + (y2 - y1) * (min(max(x, min(x1, x2)), max(x1, x2)) - x1) / (x2 - x1) for x in (left, right)]
+    return min(ends), max(ends)
+
+
+def _pair_tables(body: Body, skin: float) -> dict[str, np.ndarray]:
+    joined = {frozenset(pair) for pair in body.springs.tolist()}
+    n = body.mass_count
+    pairs = [(a, b) for a in range(n) for b in range(a + 1, n) if frozenset((a, b)) not in joined]
+    # in this order neighbours in the list rarely share a mass, and so need not wait for each other
+    pairs.sort(key=lambda pair: (pair[1] - pair[0], pair[0]))
+    a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    turn = body.angle[b] - body.angle[a]
+    extent = _mass_tables(body)["extent"]
+    return {
+        "pair_a": a,
+        "pair_b": b,
+        "pair_reach": extent[a] + extent[b] + math.sqrt(2) * 2 * skin + MARGIN,
+        "pair_cosine": np.cos(turn),
+        "pair_sine": np.sin(turn),
+        "pair_share_a": body.mass[b] / (body.mass[a] + body.mass[b]),
+        "pair_share_b": body.mass[a] / (body.mass[a] + body.mass[b]),
+    }
