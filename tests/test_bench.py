@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from turgor import bench
+from turgor.bench import parts
+from turgor.errors import InvalidInput
 from turgor.simulate import Simulator, available_cores
 from turgor.task import make_task
 
@@ -39,7 +41,7 @@ COLUMNS = [
 @pytest.fixture(scope="module")
 def peer() -> Any:
     try:
-        return bench.load_peer()
+        return parts.load_peer()
     except bench.Skipped as reason:
         pytest.skip(str(reason))
 
@@ -50,7 +52,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_kernel_has_a_row_for_every_combination() -> None:
-    rows = list(bench.kernel(TINY))
+    rows = list(parts.kernel(TINY))
     threads = [t for t in (1, 2) if t <= available_cores()]
     expected = [
         ("small", task, controllers, batch, t)
@@ -68,18 +70,18 @@ def test_kernel_has_a_row_for_every_combination() -> None:
 
 @pytest.mark.parametrize("kind", ["random", "evolved"])
 def test_controllers_do_not_depend_on_the_batch(kind: str) -> None:
-    task = bench.make_task("hilly", "small", TINY.steps)
-    many = bench.controllers(kind, task, 50, TINY.generations)
+    task = parts.make_task("hilly", "small", TINY.steps)
+    many = parts.controllers(kind, task, 50, TINY.generations)
     assert many.shape == (50, task.parameter_count)
     assert len(np.unique(many, axis=0)) == 50
-    few = bench.controllers(kind, task, 3, TINY.generations)
+    few = parts.controllers(kind, task, 3, TINY.generations)
     np.testing.assert_array_equal(few, many[:3])
-    bench.evolved.cache_clear()
-    np.testing.assert_array_equal(bench.controllers(kind, task, 50, TINY.generations), many)
+    parts.evolved.cache_clear()
+    np.testing.assert_array_equal(parts.controllers(kind, task, 50, TINY.generations), many)
 
 
 def test_memory_startup_and_evolution(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "FIRST_ROLLOUT", "pass")  # compiling takes long
+    monkeypatch.setattr(parts, "FIRST_ROLLOUT", "pass")  # compiling takes long
     rows = {row.name: row for part in ("memory", "startup", "evolution") for row in bench.PARTS[part](TINY)}
     wanted = {"memory.peak", "startup.import", "startup.cold", "startup.warm", "evolution.wall", "evolution.robust"}
     assert wanted <= set(rows)
@@ -89,7 +91,7 @@ def test_memory_startup_and_evolution(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_peer_rows(peer: Any) -> None:
-    rows = list(bench.peer(TINY))
+    rows = list(parts.peer(TINY))
     names = ["peer.box2d", "peer.engine", "peer.engine", "peer.ratio", "peer.ratio", "peer.difference"]
     assert [row.name for row in rows] == 2 * names
     assert [row.batch for row in rows[:6]] == [1, 1, 20, 1, 20, 1]
@@ -141,8 +143,8 @@ def test_a_part_that_cannot_be_measured_says_so(
         raise RuntimeError("no luck")
         yield
 
-    bench.load_peer.cache_clear()
-    monkeypatch.setattr(bench, "PEER", Path("nowhere/box2d_peer.py"))
+    parts.load_peer.cache_clear()
+    monkeypatch.setattr(parts, "PEER", Path("nowhere/box2d_peer.py"))
     monkeypatch.setitem(bench.PARTS, "memory", broken)
     assert bench.main(["--quick", "--only", "memory", "peer"]) == 1
     told = capsys.readouterr().err

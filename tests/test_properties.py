@@ -153,8 +153,9 @@ def test_states_stay_finite(body: Body, scene: Scene, seed: int, data: st.DataOb
 @quick
 @given(body=rings(), seed=st.integers(0, 99), data=st.data())
 def test_rings_stay_above_the_ground(body: Body, seed: int, data: st.DataObject) -> None:
-    """No mass's centre is ever below the ground line (by more than 0.1 m), nor beyond a terrain's end walls, unless it moves by
-    more than half its side in a step: there is no continuous collision. Ground brings back even those within 5 steps.
+    """No mass's centre is ever below the ground line (by more than 0.1 m), nor beyond a terrain's end walls, unless
+    it moves by more than half its side in a step: there is no continuous collision. Even those that get 0.5 m below
+    a plane are back within 5 steps.
     """
     scene = data.draw(st.sampled_from([flat(), None])) or hills_of(data.draw, 0.2)
     height = 0.1 + ground_under(scene, np.linspace(-14, 14, 400)).max()
