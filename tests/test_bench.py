@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 from pathlib import Path
@@ -161,6 +162,18 @@ def test_wrong_options_are_told_before_measuring(arguments: list[str], capsys: p
     assert printed.out == ""
     assert printed.err.count("\n") == 1
     assert "expected" in printed.err
+
+
+@pytest.mark.parametrize("place", ["a_file/rows", "no_folder/rows", "n" * 300], ids=["below a file", "nowhere", "long"])
+def test_files_are_tried_before_measuring(place: str, tmp_path: Path) -> None:
+    (tmp_path / "a_file").write_text("kept", encoding="utf-8")
+    parser = argparse.ArgumentParser()
+    bench.add_arguments(parser)
+    options = parser.parse_args(["--csv", str(tmp_path / "rows.csv"), "--json", str(tmp_path / place)])
+    with pytest.raises(InvalidInput, match=r"^--json: expected a file that can be written; got .*\(.+\)$"):
+        bench.run(options)
+    assert [file.name for file in tmp_path.iterdir()] == ["a_file"]
+    assert (tmp_path / "a_file").read_text(encoding="utf-8") == "kept"
 
 
 def test_ctrl_c_keeps_what_was_measured(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

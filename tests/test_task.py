@@ -80,12 +80,16 @@ REFUSED: dict[str, tuple[Any, str, str]] = {
     "unknown variant": (lambda: make_task(gravitas=1), "variant: expected one of", "'gravitas'"),
     "negative seed": (lambda: make_task(seed=-1), "seed: expected a whole number", "-1"),
     "seed of words": (lambda: make_task(seed="one"), "seed: expected a whole number", "one"),
-    "variant of words": (lambda: make_task(gravity="strong"), "physics", "str"),
+    "variant of words": (lambda: make_task(gravity="strong"), "gravity: expected a number", "strong"),
     "negative gravity": (lambda: make_task(gravity=-1.0), "gravity: expected a number that is not negative", "-1"),
     "no time step": (lambda: make_task(dt=0.0), "dt: expected", "0"),
     "no window": (lambda: make_task(window=0), "window: expected a whole number", "0"),
-    "unknown observation": (lambda: make_task(observation="raw"), "observation", "raw"),
-    "unknown length": (lambda: make_task(pressure_length="long"), "pressure_length", "long"),
+    "unknown observation": (lambda: make_task(observation="raw"), "observation: expected one of signed, unit", "raw"),
+    "unknown length": (
+        lambda: make_task(pressure_length="long"),
+        "pressure_length: expected one of true, commanded",
+        "long",
+    ),
     "no steps": (lambda: make_task(steps=0), "steps: expected a whole number", "0"),
     "unknown fitness": (lambda: own(fitness="speed"), "fitness: expected one of", "'speed'"),
     "side of an own body": (lambda: make_task(body=SMALL, side=2.0), "side: expected a named body", ""),
@@ -120,9 +124,6 @@ REFUSED: dict[str, tuple[Any, str, str]] = {
 
 # where the words come from msgspec, or nothing came
 WITHOUT_GOT = {
-    "variant of words",
-    "unknown observation",
-    "unknown length",
     "side of an own body",
     "JSON of another thing",
 }

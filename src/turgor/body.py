@@ -102,13 +102,13 @@ class Body(msgspec.Struct, frozen=True, eq=False, kw_only=False):
 
     def area(self, position: np.ndarray) -> np.ndarray:
         """Signed (shoelace) area of each chamber [m^2], shape [..., chamber], for `position` [..., mass, 2]."""
-        areas = []
-        for loop in self.chambers:
-            here = position[..., list(loop), :]
-            following = np.roll(here, -1, axis=-2)
-            cross = here[..., 0] * following[..., 1] - following[..., 0] * here[..., 1]
-            areas.append(0.5 * cross.sum(axis=-1))
-        return np.stack(areas, axis=-1) if areas else np.zeros((*position.shape[:-2], 0))
+        areas = np.zeros((*position.shape[:-2], self.chamber_count))
+        for c, loop in enumerate(self.chambers):
+            # edge by edge: NumPy's sum adds in an order that depends on the batch, and so do its last bits
+            for i, k in zip(loop, loop[1:] + loop[:1], strict=True):
+                here, following = position[..., i, :], position[..., k, :]
+                areas[..., c] += 0.5 * (here[..., 0] * following[..., 1] - following[..., 0] * here[..., 1])
+        return areas
 
     def lowest_corner(self) -> float:
         """Lowest y of any square's corner [m] when the body stands at its own origin."""

@@ -10,7 +10,7 @@ import hashlib
 import inspect
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -199,16 +199,23 @@ def _grouped(variants: Mapping[str, Any]) -> dict[type, Any]:
             raise one_of("variant", sorted(known), name)
     groups = {}
     for group in VARIANT_GROUPS:
-        chosen = {name: value for name, value in variants.items() if known[name] is group}
-        try:
-            groups[group] = msgspec.convert({**_defaults(group), **chosen}, group)
-        except msgspec.ValidationError as error:
-            raise InvalidInput(f"{group.__name__.lower()}: {error}") from None
+        hints = get_type_hints(group)
+        chosen = {name: _checked(name, value, hints[name]) for name, value in variants.items() if known[name] is group}
+        groups[group] = group(**chosen)
     return groups
 
 
-def _defaults(group: type[msgspec.Struct]) -> dict[str, Any]:
-    return msgspec.structs.asdict(group())
+def _checked(name: str, value: Any, hint: Any) -> Any:
+    """`value` as the type that a variant has; raises `InvalidInput` for one that is not."""
+    try:
+        return msgspec.convert(value, hint)
+    except msgspec.ValidationError:
+        literal = next((h for h in (hint, *get_args(hint)) if get_origin(h) is Literal), None)
+        if literal is not None:
+            raise one_of(name, get_args(literal), value) from None
+        raise InvalidInput(
+            f"{name}: expected a {'whole ' if int in (hint, *get_args(hint)) else ''}number", repr(value)
+        ) from None
 
 
 def _make_body(body: str | Body, elements: Elements) -> Body:

@@ -4,9 +4,10 @@
     v = select(x < 0.5, x, 2.0 * x)     comparisons make masks; both sides are computed
     if any_lane(x < 0.5): ...           the only branch on lane values
 
-Numbers mix freely with lanes. Operators: + - * / and unary -, comparisons, & | ~ on masks; min, max, abs, math.sqrt. No
-operation mixes lanes, but `any_lane` and `highest` for decisions, or depends on the processor: every one is rounded by
-IEEE 754 as written (no fast-math flag, no fused multiply-add), so that a lane's bits do not depend on the instruction set.
+Numbers mix freely with lanes. Operators: + - * / and unary -, comparisons, & | ~ on masks; min, max, abs,
+math.sqrt. No operation mixes lanes, but `any_lane` and `highest` for decisions, or depends on the processor:
+every one is rounded by IEEE 754 as written (no fast-math flag, no fused multiply-add), so that a lane's bits do
+not depend on the instruction set.
 
 This file knows nothing of agents. It stands on Numba's extension API; its tests pin the tested range.
 """
@@ -136,7 +137,8 @@ def _instruction(for_float: str, for_int: str) -> Callable[..., ir.Value]:
 def _comparison(symbol: str) -> Callable[..., ir.Value]:
     def emit(builder: Any, lanes: Lanes, a: Any, b: Any) -> Any:
         if lanes.kind == "float":
-            return builder.fcmp_ordered(symbol, a, b)
+            # as in IEEE 754 and NumPy: NaN differs from everything, and every other comparison with it fails
+            return (builder.fcmp_unordered if symbol == "!=" else builder.fcmp_ordered)(symbol, a, b)
         return builder.icmp_signed(symbol, a, b)
 
     return emit

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
@@ -188,6 +189,7 @@ FIELD: dict[Any, tuple[str, bool]] = {
 }
 
 
+@cache
 def fields(views: type) -> dict[str, tuple[type, str]]:
     """{field: (annotation, name of its length)} of a NamedTuple of views."""
     hints = get_type_hints(views, include_extras=True)

@@ -21,12 +21,19 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from turgor.body import Body
 from turgor.control import rows
+from turgor.physics.reference_contacts import (
+    Manifold,
+    geometry,
+    near_pairs,
+    near_segments,
+    square_segment,
+    square_square,
+)
 from turgor.recording import Recording
 from turgor.scene import Scene
 from turgor.task import Leave, Physics, Task, start_position
 
 WORLD = -1  # index of the static world: the row after the last mass, with infinite mass
-RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.98, 0.001  # [1], [m]: to prefer a second reference face
 
 Key = tuple[str, int, int]  # ("ground", mass, segment) or ("pair", a, b) with a < b
 Stored = tuple[int, float, float]  # feature id, normal and tangential impulse [N s]
@@ -66,12 +73,6 @@ class Constants(msgspec.Struct, frozen=True):
 
     mass: Any  # [kg], shape [mass]
     inverse_mass: Any  # [1/kg], shape [mass + 1]
-    face_normal: Any  # [1], shape [mass, 4, 2]: -b, a, b, -a of the square's axes a and b
-    vertex: Any  # [m], shape [mass, 4, 2], relative to the centre; face f goes from vertex f to f + 1
-    reach: Any  # [m], shape [mass], from the centre to a vertex
-    bonded: Any  # bool, shape [mass, mass]: never collide
-    ends: Any  # [m], shape [segment, 2, 2]
-    normal: Any  # [1], shape [segment, 2], towards the free side
     stiffness: Any  # k [N/m], shape [spring]
     damping: Any  # c [N s/m], shape [spring]
 
@@ -79,24 +80,13 @@ class Constants(msgspec.Struct, frozen=True):
 @functools.lru_cache(maxsize=64)
 def constants(task: Task, dtype: DTypeLike) -> Constants:
     """The arrays of `task`, in `dtype`."""
-    body, scene = task.body, task.scene
-    a = np.stack([np.cos(body.angle), np.sin(body.angle)], axis=1)
-    b = np.stack([-a[:, 1], a[:, 0]], axis=1)
-    half = body.side[:, None] / 2
+    body = task.body
     i, j = body.springs.T
-    bonded = np.eye(body.mass_count, dtype=bool)
-    bonded[i, j] = bonded[j, i] = True
     # m = 1 / (1/m_i + 1/m_j), ω = 2 π f:  k = m ω²,  c = 2 m ζ ω
     reduced, omega = 1 / (1 / body.mass[i] + 1 / body.mass[j]), 2 * np.pi * body.frequency
     return Constants(
         mass=body.mass.astype(dtype),
         inverse_mass=np.append(1 / body.mass, 0).astype(dtype),
-        face_normal=np.stack([-b, a, b, -a], axis=1).astype(dtype),
-        vertex=(half[:, None] * np.stack([-a - b, a - b, a + b, b - a], axis=1)).astype(dtype),
-        reach=(half[:, 0] * np.sqrt(2)).astype(dtype),
-        bonded=bonded,
-        ends=scene.segments.reshape(-1, 2, 2).astype(dtype),
-        normal=scene.normal.astype(dtype),
         stiffness=(reduced * omega**2).astype(dtype),
         damping=(2 * reduced * body.damping_ratio * omega).astype(dtype),
     )
@@ -240,7 +230,7 @@ def find_contacts(state: State, task: Task) -> list[Contact]:
     Pairs come first, then ground by mass, last segment first: where Box2D's order by age mostly leads, as its
     islands start at a mass's newest contacts.
     """
-    c, x, skin = constants(task, state.position.dtype), state.position, 2 * task.physics.skin
+    g, x, skin = geometry(task, state.position.dtype), state.position, 2 * task.physics.skin
     contacts = []
 
     def add(key: Key, a: int, b: int, friction: float, manifold: Manifold | None) -> None:
@@ -254,121 +244,14 @@ def find_contacts(state: State, task: Task) -> list[Contact]:
         impulses = map(list, zip(*stored, strict=True))
         contacts.append(Contact(key, a, b, normal, friction, ids, distance, *impulses))
 
-    for a, b in near_pairs(x, c, skin):
-        add(("pair", a, b), a, b, task.body.friction, square_square(x, c, a, b, skin))
+    for a, b in near_pairs(x, g, skin):
+        add(("pair", a, b), a, b, task.body.friction, square_square(x, g, a, b, skin))
     friction = float(np.sqrt(task.body.friction * task.scene.friction))
-    for mass, segment in near_segments(x, task, c, skin):
+    for mass, segment in near_segments(x, task, g, skin):
         depth = task.scene.depth[segment]
-        manifold = square_segment(x[mass], c, mass, c.ends[segment], c.normal[segment], depth, skin)
+        manifold = square_segment(x[mass], g, mass, g.ends[segment], g.normal[segment], depth, skin)
         add(("ground", mass, segment), WORLD, mass, friction, manifold)
     return contacts
-
-
-def near_segments(x: np.ndarray, task: Task, c: Constants, skin: float) -> list[tuple[int, int]]:
-    """Pairs of mass and segment that may touch, in the solver's order: a cheap test before the exact one."""
-    low, high = c.ends.min(axis=1), c.ends.max(axis=1)
-    reach = c.reach[:, None] + skin
-    behind = -np.einsum("sk,msk->ms", c.normal, x[:, None] - c.ends[:, 0])
-    below = np.where(behind > 0, np.inf, reach)  # the depth limits how far, along the normal
-    near = (behind >= -reach) & (behind <= task.scene.depth)
-    for k, margin in ((0, reach), (1, below)):
-        near &= (x[:, None, k] >= low[:, k] - margin) & (x[:, None, k] <= high[:, k] + margin)
-    last = near.shape[1] - 1
-    return [(int(m), int(last - s)) for m, s in np.argwhere(near[:, ::-1])]
-
-
-def near_pairs(x: np.ndarray, c: Constants, skin: float) -> list[tuple[int, int]]:
-    """Pairs of masses a < b that may touch; the two ends of a spring never do."""
-    apart = np.linalg.norm(x[:, None] - x, axis=-1) > c.reach[:, None] + c.reach + skin
-    return [(int(a), int(b)) for a, b in np.argwhere(np.triu(~apart & ~c.bonded))]
-
-
-Point = tuple[int, Any]  # feature id, separation [m] of the bare shapes
-Manifold = tuple[np.ndarray, list[Point]]  # normal from a to b, its points in the solver's order
-
-# A feature id is 8 reference + corner. Reference: 0 the segment, 1 + f face f of the square; between squares
-# 1 + f face f of a, 5 + f face f of b. Corner: the vertex 0..3 of the incident square, or the end 0, 1 of the
-# incident segment; 4 and 5 for a point cut off at the first and second end of the reference face.
-
-
-def square_segment(
-    x: np.ndarray, c: Constants, mass: int, ends: np.ndarray, normal: np.ndarray, depth: float, skin: float
-) -> Manifold | None:
-    """The contact of a square at `x` with a segment, on the segment's free side."""
-    vertex, face = x + c.vertex[mass], c.face_normal[mass]
-    behind = -(normal @ (x - ends[0]))
-    if behind > 0:  # ground pushes out what lies within its depth; everything else ignores what is behind it
-        inside = ends[:, 0].min() <= x[0] <= ends[:, 0].max()
-        if not (inside and behind <= depth):
-            return None
-        points = [(k, vertex[k]) for k in incident(face, normal)]
-        return keep(normal, normal, ends[0], points, skin)
-    # s_E = min over vertices N . (v - p1);  s_i = min over both ends of n_i . (p - v_i)
-    edge_separation = (vertex @ normal).min() - normal @ ends[0]
-    separation = (face @ ends.T).min(axis=1) - (face * vertex).sum(axis=1)
-    best = int(separation.argmax())
-    if max(edge_separation, separation[best]) > skin:
-        return None
-    if separation[best] > RELATIVE_TOLERANCE * edge_separation + ABSOLUTE_TOLERANCE:
-        r = 8 * (1 + best)
-        points = [(r, ends[0]), (r + 1, ends[1])]
-        reference, outward = vertex[[best, (best + 1) % 4]], face[best]
-        return keep(-outward, outward, reference[0], clip(points, reference, 0.0, r), skin)
-    points = [(k, vertex[k]) for k in incident(face, normal)]
-    return keep(normal, normal, ends[0], clip(points, ends, 0.0, 0), skin)
-
-
-def square_square(x: np.ndarray, c: Constants, a: int, b: int, skin: float) -> Manifold | None:
-    """The contact of two squares; its reference face is a's unless one of b's separates them better."""
-    vertex, face = x[[a, b], None] + c.vertex[[a, b]], c.face_normal[[a, b]]
-    separation = [face_separation(vertex[s], face[s], vertex[1 - s]) for s in (0, 1)]
-    best = [int(s.argmax()) for s in separation]
-    most = [s.max() for s in separation]
-    if max(most) > skin:
-        return None
-    own = 1 if most[1] > RELATIVE_TOLERANCE * most[0] + ABSOLUTE_TOLERANCE else 0
-    f, other = best[own], 1 - own
-    reference, outward = vertex[own][[f, (f + 1) % 4]], face[own][f]
-    r = 8 * (1 + 4 * own + f)
-    points = [(r + k, vertex[other][k]) for k in incident(face[other], outward)]
-    normal = -outward if own else outward
-    return keep(normal, outward, reference[0], clip(points, reference, skin, r), skin)
-
-
-def face_separation(vertex: np.ndarray, face: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Separation [m] of each of a square's faces from the `other` square's deepest vertex, shape [4]."""
-    return (face @ other.T).min(axis=1) - (face * vertex).sum(axis=1)
-
-
-def incident(face: np.ndarray, normal: np.ndarray) -> tuple[int, int]:
-    """The two vertices of the face that looks most against `normal`."""
-    k = int((face @ normal).argmin())
-    return k, (k + 1) % 4
-
-
-def clip(points: list, reference: np.ndarray, margin: float, r: int) -> list:
-    """Two (id, position) `points` cut to what lies between the ends of the face `reference`; none if outside.
-
-    A cut point comes last, as in Box2D: the velocity solver takes the first point.
-    """
-    along = reference[1] - reference[0]
-    along = along / np.sqrt(along @ along)
-    for corner, outward, end in ((4, -along, reference[0]), (5, along, reference[1])):
-        if len(points) < 2:
-            return []
-        (_, p), (_, q) = points
-        s, t = outward @ (p - end) - margin, outward @ (q - end) - margin
-        points = [point for point, beyond in zip(points, (s, t), strict=True) if beyond <= 0]
-        if s * t < 0:
-            points.append((r + corner, p + s / (s - t) * (q - p)))
-    return points if len(points) == 2 else []
-
-
-def keep(normal: np.ndarray, outward: np.ndarray, origin: np.ndarray, points: list, skin: float) -> Manifold | None:
-    """The manifold of those `points` that the skins reach from the plane at `origin` that looks `outward`."""
-    kept = [(id, outward @ (p - origin)) for id, p in points]
-    kept = [(id, s) for id, s in kept if s <= skin]
-    return (normal, kept) if kept else None
 
 
 # --- solver -------------------------------------------------------------------------------------------------
@@ -568,7 +451,7 @@ def has_ended(state: State, task: Task) -> bool:
         return False
     if not isinstance(task.end, Leave):
         return bool(task.end(state.position[None])[0])
-    width = np.abs(constants(task, state.position.dtype).vertex[..., 0]).max(axis=1)
+    width = np.abs(geometry(task, state.position.dtype).vertex[..., 0]).max(axis=1)
     return bool((np.abs(state.position[:, 0]) - width > task.end.half_width).all())
 
 

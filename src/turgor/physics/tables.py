@@ -10,6 +10,7 @@ import numpy as np
 
 from turgor.body import Body
 from turgor.control import observation_count, output_count
+from turgor.errors import InvalidInput
 from turgor.physics.memory import aligned, field_of, fields, layout
 from turgor.physics.model import (
     CONTROLLED,
@@ -26,6 +27,8 @@ from turgor.physics.model import (
 )
 from turgor.scene import Scene
 from turgor.task import Leave, Task
+
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Kernel(NamedTuple):
@@ -113,6 +116,8 @@ def make_kernel(task: Task) -> Kernel:
     )
     kernel = Kernel(settings, buffer, layouts, lengths)
     for name, values in tables.items():
+        if (np.isfinite(values) & (np.abs(values) > LARGEST)).any():
+            raise InvalidInput(f"{name}: expected numbers within {LARGEST:.0e}", f"{np.abs(values).max():.3g}")
         kernel.field(buffer, Model, name)[:] = values
     return kernel
 
