@@ -1,23 +1,10 @@
-"""Benchmarks: how fast the engine is, how much memory it takes, how soon it starts, how long an evolution lasts.
-
-    turgor bench                                   everything, some minutes
-    turgor bench --only kernel peer --csv results.csv
-    turgor bench --quick                           a look, in about a minute
-
-Every row says what was measured. What is to be compared is measured in turn in one run, and the fastest of several
-repeats counts: other work on the machine only ever slows things down. benchmarks/README.md explains the rows.
-"""
+"""What is measured: every part of the benchmark yields its rows, as many and as large as the plan says."""
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import csv
 import importlib.util
-import io
 import json
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -29,11 +16,11 @@ from typing import Any
 
 import msgspec
 
-from turgor.errors import InvalidInput
+from turgor.bench.report import Row, say
 
 SEED = 0  # of controllers and of the evolution that finds evolved ones
 MILLION = 1e6
-PEER = Path(__file__).parents[2] / "benchmarks" / "box2d_peer.py"  # not part of the installed package
+PEER = Path(__file__).parents[3] / "benchmarks" / "box2d_peer.py"  # not part of the installed package
 
 
 class Plan(msgspec.Struct, frozen=True):
@@ -71,25 +58,11 @@ QUICK = Plan(
 )
 
 
-class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One figure. Fields that do not apply are empty."""
-
-    name: str
-    body: str = ""
-    task: str = ""
-    controllers: str = ""
-    batch: int | None = None  # agents at once
-    threads: int | None = None
-    value: float
-    unit: str
-    what: str
-
-
 class Skipped(Exception):
     """A part that cannot be measured here; says why."""
 
 
-# --- measuring ----------------------------------------------------------------------------------------------------
+# --- measuring --------------------------------------------------------------------------------------------------------
 
 
 def fastest(calls: Sequence[Callable[[], object]], seconds: float, repeats: int) -> list[float]:
@@ -161,11 +134,7 @@ def run_python(*arguments: str, **environment: str) -> tuple[float, str]:
     return took, done.stdout
 
 
-def say(line: str) -> None:
-    print(f"turgor bench: {line}", file=sys.stderr, flush=True)
-
-
-# --- the parts ----------------------------------------------------------------------------------------------------
+# --- the parts --------------------------------------------------------------------------------------------------------
 
 
 def kernel(plan: Plan) -> Iterator[Row]:
@@ -378,171 +347,3 @@ PARTS: dict[str, Callable[[Plan], Iterator[Row]]] = {
     "evolution": evolution,
     "peer": peer,
 }
-
-
-# --- the command --------------------------------------------------------------------------------------------------
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `turgor bench` to `parser`."""
-    parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help=f"measure these: {', '.join(PARTS)}")
-    parser.add_argument("--skip", nargs="+", choices=PARTS, metavar="PART", default=[], help="leave these out")
-    parser.add_argument("--quick", action="store_true", help="fewer rows and shorter: for a look, not for a record")
-    parser.add_argument("--csv", metavar="FILE", help="write the rows there; in a folder, to MACHINE.csv")
-    parser.add_argument("--json", metavar="FILE", help="the same as JSON; in a folder, to MACHINE.json")
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status of `turgor bench` with the options `argv` (None: the program's own)."""
-    parser = argparse.ArgumentParser(prog="turgor bench", description="Measure the engine on this machine.")
-    add_arguments(parser)
-    return run(parser.parse_args(argv))
-
-
-def run(namespace: argparse.Namespace) -> int:
-    """Exit status: 0, 1 where a part failed, 2 for a file that cannot be written, 130 after Ctrl-C."""
-    names = [name for name in PARTS if name in (namespace.only or PARTS) and name not in namespace.skip]
-    here = environment()
-    try:
-        if not names:
-            raise InvalidInput(f"--only, --skip: expected to leave one of {', '.join(PARTS)}", "none")
-        files = {kind: target(getattr(namespace, kind), kind, here["machine"]) for kind in ("csv", "json")}
-    except InvalidInput as error:
-        print(f"turgor bench: {error}", file=sys.stderr)
-        return 2
-    rows: list[Row] = []
-    began, busy, own = time.perf_counter(), machine_seconds(), own_seconds()
-    status = measure(names, QUICK if namespace.quick else Plan(), rows)
-    if busy is not None:
-        other = (machine_seconds() or 0) - busy - (own_seconds() - own)
-        here["other_load"] = f"{max(other / (time.perf_counter() - began), 0):.2f}"
-    if rows:
-        show(rows, here)
-        writers = {"csv": as_csv, "json": as_json}
-        for kind, file in files.items():
-            if file is not None:
-                file.write_text(writers[kind](rows, here), encoding="utf-8")
-                say(f"wrote {file}")
-    return status
-
-
-def measure(names: Sequence[str], plan: Plan, rows: list[Row]) -> int:
-    """Exit status of measuring the parts `names`; `rows` is filled on the way. A part that fails leaves the others."""
-    status = 0
-    try:
-        for name in names:
-            try:
-                for row in PARTS[name](plan):
-                    rows.append(row)
-                    say("  ".join(filter(None, cells(row)[:-1])))
-            except Skipped as reason:
-                say(f"{name}: skipped, because {reason}")
-            except Exception as error:
-                say(f"{name}: failed: {type(error).__name__}: {error}")
-                status = 1
-    except KeyboardInterrupt:
-        say("interrupted; what was measured follows")
-        status = 130
-    return status
-
-
-def target(path: str | None, kind: str, machine: str) -> Path | None:
-    """The file to write; raises `InvalidInput` where that cannot be, before anything is measured."""
-    if path is None:
-        return None
-    file = Path(path) / f"{machine}.{kind}" if Path(path).is_dir() else Path(path)
-    if not os.access(file if file.exists() else file.parent, os.W_OK):
-        raise InvalidInput(f"--{kind}: expected a file that can be written", str(file))
-    return file
-
-
-# --- what comes out -----------------------------------------------------------------------------------------------
-
-
-def environment() -> dict[str, str]:
-    """What every row depends on: the machine by its processor, the day, the versions, other programs' load (later)."""
-    from importlib.metadata import version
-
-    from llvmlite.binding import get_host_cpu_name
-
-    from turgor import __version__
-    from turgor.runs import machine
-
-    # "AMD EPYC" alone would name ten years of processors: the compiler's name for it tells them apart
-    facts, compiled_for = machine(), os.environ.get("NUMBA_CPU_NAME") or get_host_cpu_name()
-    model = re.sub(r"\((R|TM)\)|\bCPU\b", "", facts["cpu"], flags=re.IGNORECASE)
-    return {
-        "machine": re.sub(r"[^a-z0-9]+", "-", f"{model} {compiled_for}".lower()).strip("-"),
-        "cpu": f"{' '.join(model.split())}, {compiled_for}, {facts['cores']} cores",
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
-        "turgor": __version__,
-        "python": ".".join(map(str, sys.version_info[:3])),
-        "numba": version("numba"),
-        "other_load": "",
-    }
-
-
-def machine_seconds() -> float | None:
-    """Core-seconds that the whole machine has worked since it started; None where that is not told."""
-    try:
-        with open("/proc/stat", encoding="ascii") as file:
-            user, nice, system, _, _, irq, soft, steal = map(int, file.readline().split()[1:9])
-    except (OSError, ValueError):
-        return None
-    return (user + nice + system + irq + soft + steal) / os.sysconf("SC_CLK_TCK")
-
-
-def own_seconds() -> float:
-    """Core-seconds that this process and the ended ones that it started have worked."""
-    return sum(os.times()[:4])
-
-
-def cells(row: Row) -> list[str]:
-    """A row as text."""
-    fields = msgspec.structs.asdict(row) | {"value": f"{row.value:.4g}"}
-    return ["" if value is None else str(value) for value in fields.values()]
-
-
-def show(rows: Sequence[Row], here: dict[str, str]) -> None:
-    """Prints the rows: a table on a terminal, aligned plain lines elsewhere."""
-    title = f"{here['cpu']}; turgor {here['turgor']}, Python {here['python']}, Numba {here['numba']}; {here['date']}"
-    if here["other_load"]:
-        title += f"; other programs kept {here['other_load']} of {os.cpu_count()} cores busy"
-    names = Row.__struct_fields__
-    lines = [cells(row) for row in rows]
-    if sys.stdout.isatty():
-        from rich import box
-        from rich.console import Console
-        from rich.table import Table
-
-        table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
-        for name in names:
-            right = name in ("batch", "threads", "value")
-            table.add_column(name, justify="right" if right else "left", no_wrap=name != "what")
-        for line in lines:
-            table.add_row(*line)
-        Console().print(table)
-        return
-    width = [max(map(len, column)) for column in zip(names, *lines, strict=True)]
-    print(title)
-    with contextlib.suppress(BrokenPipeError):
-        for line in (names, *lines):
-            print("  ".join(cell.ljust(w) for cell, w in zip(line, width, strict=True)).rstrip())
-
-
-def as_csv(rows: Sequence[Row], here: dict[str, str]) -> str:
-    """The rows as CSV, each with its machine, day and versions."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*here, *Row.__struct_fields__])
-    writer.writerows([*here.values(), *cells(row)] for row in rows)
-    return text.getvalue()
-
-
-def as_json(rows: Sequence[Row], here: dict[str, str]) -> str:
-    """The same as JSON: what all rows share, and the rows."""
-    return json.dumps({**here, "rows": [msgspec.structs.asdict(row) for row in rows]}, indent=1) + "\n"
-
-
-if __name__ == "__main__":
-    sys.exit(main())
