@@ -111,17 +111,8 @@ def controllers(task: Task, agents: int, seed: int, scale: float = 1.0) -> np.nd
     return np.random.default_rng(seed).uniform(-scale, scale, (agents, task.parameter_count))
 
 
-@pytest.fixture
-def engine_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Makes the reference solve pairs in the engine's order, by the distance of their indices: any order is as good
-    as any other (Box2D's is by age), but two contacts of one mass solved the other way round differ by far more than
-    rounding."""
-    plain = reference.near_pairs
-    monkeypatch.setattr(reference, "near_pairs", lambda *args: sorted(plain(*args), key=lambda p: (p[1] - p[0], p[0])))
-
-
 @pytest.mark.parametrize("body", BODIES)
-def test_the_engines_pairs_are_in_the_order_that_these_tests_assume(body: str) -> None:
+def test_the_engines_pairs_are_in_the_references_order(body: str) -> None:
     kernel = make_kernel(make_task("flat", body=body))
     a, b = (kernel.field(kernel.tables, Model, name) for name in ("pair_a", "pair_b"))
     pairs = list(zip(a.tolist(), b.tolist(), strict=True))
@@ -136,7 +127,7 @@ def test_the_engines_pairs_are_in_the_order_that_these_tests_assume(body: str) -
 @pytest.mark.parametrize("condition", CONDITIONS)
 @pytest.mark.parametrize("body", BODIES)
 @pytest.mark.parametrize("name", NAMES)
-def test_the_first_30_steps(name: str, body: str, condition: str, engine_order: None) -> None:
+def test_the_first_30_steps(name: str, body: str, condition: str) -> None:
     task = msgspec.structs.replace(make_task(name, body=body, condition=condition), steps=30)
     theta = controllers(task, 1, seed=BODIES.index(body))[0]
     mine, plain = Simulator(task).record(theta), reference.rollout(task, theta)
@@ -284,7 +275,7 @@ def compared(case: str) -> list[Compared]:
 
 
 @pytest.mark.parametrize("case", STATES)
-def test_single_steps_from_copied_states(case: str, engine_order: None) -> None:
+def test_single_steps_from_copied_states(case: str) -> None:
     results = compared(case)
     wrong = [r for r in results if not r.difference.small()]
     assert all(r.undecided for r in wrong), "\n".join(map(str, wrong))
@@ -292,7 +283,7 @@ def test_single_steps_from_copied_states(case: str, engine_order: None) -> None:
     assert len(wrong) <= 1
 
 
-def test_the_copied_states_are_of_all_kinds(engine_order: None) -> None:
+def test_the_copied_states_are_of_all_kinds() -> None:
     results = [r for case in STATES for r in compared(case)]
     assert len(results) >= 200
     assert sum(r.grounds > 0 for r in results) >= 150

@@ -146,7 +146,7 @@ def observe(state: State, task: Task) -> np.ndarray:
     """One observation: touch, x and y of each mass, velocity x, y, pressure of each chamber."""
     sensing, body, mass = task.sensing, task.body, constants(task, state.position.dtype).mass
     com = np.average(state.position, axis=0, weights=mass)
-    relative = (state.position - com) / (sensing.position_scale * body.radius)
+    relative = (state.position - com) / (sensing.position_scale * body.radius or np.inf)
     velocity = np.average(state.velocity, axis=0, weights=mass) / sensing.velocity_scale
     signed = np.clip(np.concatenate([relative.ravel(), velocity]), -1, 1)
     if sensing.observation == "unit":
