@@ -58,18 +58,18 @@ def test_kernel_has_a_row_for_every_combination() -> None:
     expected = [
         ("small", task, controllers, batch, t)
         for task in ("hilly", "escape")
-        for controllers in ("random", "evolved")
+        for controllers in ("random", "inflated", "evolved")
         for batch in (1, 20)
         for t in threads
     ]
     rates = [row for row in rows if row.name == "kernel"]
     assert [(r.body, r.task, r.controllers, r.batch, r.threads) for r in rates] == expected
     scaling = [row for row in rows if row.name == "kernel.scaling"]
-    assert [(r.batch, r.threads) for r in scaling] == [(20, t) for _ in range(4) for t in threads[1:]]
+    assert [(r.batch, r.threads) for r in scaling] == [(20, t) for _ in range(6) for t in threads[1:]]
     assert all(row.value > 0 and row.unit and row.what for row in rows)
 
 
-@pytest.mark.parametrize("kind", ["random", "evolved"])
+@pytest.mark.parametrize("kind", ["random", "inflated", "evolved"])
 def test_controllers_do_not_depend_on_the_batch(kind: str) -> None:
     task = parts.make_task("hilly", "small", TINY.steps)
     many = parts.controllers(kind, task, 50, TINY.generations)

@@ -28,7 +28,7 @@ class Plan(msgspec.Struct, frozen=True):
 
     bodies: tuple[str, ...] = ("small", "medium", "large")
     tasks: tuple[str, ...] = ("hilly", "escape")
-    controllers: tuple[str, ...] = ("random", "evolved")
+    controllers: tuple[str, ...] = ("random", "inflated", "evolved")
     batches: tuple[int, ...] = (1, 20, 1024)
     threads: tuple[int, ...] = (1, 2)
     steps: int = 1800  # of a rollout
@@ -80,19 +80,21 @@ def fastest(calls: Sequence[Callable[[], object]], seconds: float, repeats: int)
 
 
 @cache
-def make_task(name: str, body: str, steps: int) -> Any:
-    """The benchmark's `Task`: terrain 0, pressure and springs controlled."""
+def make_task(name: str, body: str, steps: int, kind: str = "random") -> Any:
+    """The benchmark's `Task` for a kind of controllers: terrain 0, pressure and springs controlled. "inflated" bodies
+    keep their gas, because their pressure moves by the paper's 1 Pa per unit of output, 27 to 53 times less."""
     from turgor.task import make_task
 
-    return make_task(name, body=body, condition="pressure", seed=SEED, steps=steps)
+    unit = 1.0 if kind == "inflated" else None
+    return make_task(name, body=body, condition="pressure", seed=SEED, steps=steps, pressure_unit=unit)
 
 
 def controllers(kind: str, task: Any, agents: int, generations: int) -> Any:
-    """Controllers theta [agent, parameter]: "random" (uniform in [-1, 1]) or "evolved"; the first are the same
-    whatever `agents`."""
+    """Controllers theta [agent, parameter]: "random" and "inflated" (uniform in [-1, 1]) or "evolved"; the first are
+    the same whatever `agents`."""
     import numpy as np
 
-    if kind == "random":
+    if kind != "evolved":
         return np.random.default_rng(SEED).uniform(-1, 1, (agents, task.parameter_count))
     champion, strategy, drawn = evolved(task, generations)
     while len(drawn) < agents:
@@ -151,7 +153,7 @@ def kernel_rows(plan: Plan, body: str, name: str, kind: str, batch: int, threads
     """Rows of one batch: one for each number of threads, measured in turn; how they compare for the largest batch."""
     from turgor.simulate import Simulator
 
-    task = make_task(name, body, plan.steps)
+    task = make_task(name, body, plan.steps, kind)
     theta = controllers(kind, task, batch, plan.generations)
     simulators = [Simulator(task, threads=t) for t in threads]
     agent_steps = int(simulators[0].rollout(theta).steps.sum())
@@ -295,7 +297,8 @@ def peer_rows(plan: Plan, box2d_peer: Any, body: str, kind: str) -> Iterator[Row
 
     from turgor.simulate import Simulator
 
-    task, simulator = make_task("hilly", body, plan.steps), Simulator(make_task("hilly", body, plan.steps), threads=1)
+    task = make_task("hilly", body, plan.steps, kind)
+    simulator = Simulator(task, threads=1)
     many = controllers(kind, task, plan.peer_batch, plan.generations)
     few = many[: plan.peer_agents]
 
