@@ -94,7 +94,7 @@ def test_memory_startup_and_evolution(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_peer_rows(peer: Any) -> None:
     rows = list(parts.peer(TINY))
     names = ["peer.box2d", "peer.engine", "peer.engine", "peer.ratio", "peer.ratio", "peer.difference"]
-    assert [row.name for row in rows] == 2 * names
+    assert [row.name for row in rows] == 3 * names
     assert [row.batch for row in rows[:6]] == [1, 1, 20, 1, 20, 1]
     assert rows[4].value == pytest.approx(rows[2].value / rows[0].value)
     assert rows[5].value <= 1e-4
