@@ -12,6 +12,7 @@ import pytest
 import turgor
 from turgor.body import LARGE, MEDIUM, SMALL, Body, ring
 from turgor.physics import reference
+from turgor.recording import tangled
 from turgor.scene import Scene, flat
 from turgor.simulate import Simulator, perturbed, replay
 from turgor.task import Leave, Task, make_task, resting
@@ -482,3 +483,13 @@ def test_perturbed_starts() -> None:
     np.testing.assert_array_equal(position.astype(np.float32), base)
     larger = perturbed(position, 3, size=0.5)
     np.testing.assert_allclose(np.abs(larger - base).max(axis=(1, 2)), 0.5, rtol=1e-6)
+
+
+def test_a_body_around_a_wall_is_tangled() -> None:
+    body = turgor.ring(4, 2.0)
+    wall, ground = Scene([[0.0, -9.0, 0.0, 9.0]]), Scene([[0.0, -9.0, 0.0, 9.0]], depth=2.0)
+    positions = np.stack([body.position + [dx, 0.0] for dx in (-3.0, -1.0, 0.5, 3.0)])
+    assert tangled(positions, body, wall).tolist() == [False, True, True, False]
+    assert not tangled(positions, body, ground).any()  # ground is no wall
+    short = Scene([[0.0, -0.5, 0.0, 0.5]])  # inside the ring it touches no spring
+    assert not tangled(body.position, body, short)

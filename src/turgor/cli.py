@@ -235,6 +235,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     import numpy as np
 
     from turgor.evolution.loop import evaluate
+    from turgor.recording import tangled
     from turgor.runs import Run, write_whole
     from turgor.simulate import Simulator
 
@@ -246,6 +247,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     low, median, high = np.percentile(out.fitness, [25, 50, 75]).tolist()
     least, most = float(out.fitness.min()), float(out.fitness.max())
     solved = int(out.solved.sum()) if run.task.end is not None else None
+    around = int(tangled(out.position, run.task.body, run.task.scene).sum())
     if options.json is not None:
         import msgspec
 
@@ -259,6 +261,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             "min": least,
             "max": most,
             "solved": solved,
+            "tangled": around,
             "each": out.fitness.tolist(),
         }
         data = msgspec.json.format(msgspec.json.encode(result)) + b"\n"
@@ -272,7 +275,10 @@ def _evaluate(options: argparse.Namespace) -> None:
     say(f"robust     {_spread(out.fitness, unit)}, of {options.repeats} starts moved by 1e-6 m")
     say(f"range      {least:.3f} to {most:.3f}{unit}")
     if solved is not None:
+        steps = simulator.record(champion.theta).tangled
         say(f"solved     {solved} of {options.repeats}")
+        say(f"tangled    {around} of {options.repeats} at the end (a wall through a spring); the champion itself")
+        say(f"           in {steps.sum()} of its {len(steps) - 1} steps")
 
 
 def _video_options(parser: Parser) -> None:

@@ -67,18 +67,16 @@ class Recording(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
     @property
     def tangled(self) -> np.ndarray:
-        """Whether any segment of the scene goes through a spring, bool, shape [step + 1]."""
+        """Whether any wall of the scene goes through a spring, bool, shape [step + 1]."""
         return tangled(np.asarray(self.position, dtype=np.float64), self.body, self.scene)
 
 
 def tangled(position: np.ndarray, body: Body, scene: Scene) -> np.ndarray:
-    """Whether any segment of `scene` crosses any spring of `body` at `position` [m] [..., mass, 2]; bool [...].
-
-    Springs collide with nothing, so a body can close around a wall.
-    """
+    """Whether any wall of `scene` (a segment without depth) crosses any spring of `body` at `position` [m],
+    shape [..., mass, 2]; bool [...]. Springs collide with nothing, so a body can close around a wall."""
     crossed = np.zeros(position.shape[:-2], dtype=bool)
     a, b = position[..., body.springs[:, 0], :], position[..., body.springs[:, 1], :]
-    for x1, y1, x2, y2 in scene.segments:
+    for x1, y1, x2, y2 in scene.segments[scene.depth == 0]:
         p, q = np.array([x1, y1]), np.array([x2, y2])
         ends_apart = _side(a, b, p) * _side(a, b, q) < 0
         crossed |= (ends_apart & (_side(p, q, a) * _side(p, q, b) < 0)).any(axis=-1)
