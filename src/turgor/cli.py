@@ -140,9 +140,10 @@ def _evolve(options: argparse.Namespace) -> None:
     variants = {name: value for name, value in chosen.items() if value is not None}
     task = make_task(options.task, body=options.body, condition=options.condition, seed=options.seed, **variants)
     from turgor.evolution.loop import evolve
-    from turgor.runs import free_folder
+    from turgor.runs import check_new, free_folder
 
     out = options.out or free_folder(f"{task.name}-{options.body}-{task.condition}-s{options.seed}")
+    check_new(out)
     recipe = {"name": task.name, "body": options.body, "condition": task.condition, "seed": options.seed, **variants}
     say(
         f"evolving {_name(task, recipe)}: {task.parameter_count:,} parameters, {options.evaluations:,} evaluations "

@@ -115,10 +115,7 @@ class Run:
         if path is None:
             return cls(task, settings)
         folder = Path(path)
-        if folder.exists() and not folder.is_dir():
-            raise InvalidInput("out: expected a new or empty folder", f"{folder}, which is a file")
-        if folder.is_dir() and any(folder.iterdir()):
-            raise InvalidInput("out: expected a new or empty folder", f"{folder}, which is not empty")
+        check_new(folder)
         folder.mkdir(parents=True, exist_ok=True)
         run = cls(task, settings, folder)
         run.write_record()
@@ -256,6 +253,14 @@ class Run:
         fields = msgspec.to_builtins(record).items()
         lines = [f'  "{name}": {msgspec.json.encode(value).decode()}' for name, value in fields]
         write_whole(self.path / "run.json", ("{\n" + ",\n".join(lines) + "\n}\n").encode())
+
+
+def check_new(folder: Path) -> None:
+    """Raises `InvalidInput` unless `folder` is new or empty."""
+    if folder.exists() and not folder.is_dir():
+        raise InvalidInput("out: expected a new or empty folder", f"{folder}, which is a file")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InvalidInput("out: expected a new or empty folder", f"{folder}, which is not empty")
 
 
 def free_folder(stem: str, parent: str | os.PathLike[str] = "runs") -> Path:
