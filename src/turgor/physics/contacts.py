@@ -58,7 +58,8 @@ def add_ground_contact(settings, model, state, work, i, slot, count):
     py = state.py[slot] - y
     above = -(nx * px + ny * py)
     gap_segment = above - state.extent[slot]
-    if not any_lane((gap_segment <= settings.reach) & (above >= -depth)):
+    near = (gap_segment <= settings.reach) & (above >= -depth)
+    if not any_lane(near):
         state.ground_live[slot] = 0
         return count
 
@@ -68,7 +69,6 @@ def add_ground_contact(settings, model, state, work, i, slot, count):
     gap_face, face, u1, w1, u2, w2 = nearest_face(half, model.cosine[i], model.sine[i], px, py, qx, qy)
     behind = above < 0.0
     over = (min(px, qx) <= 0.0) & (max(px, qx) >= 0.0)
-    near = (gap_segment <= settings.reach) & (above >= -depth)
     touches = near & ((~behind & (gap_face <= settings.reach)) | (behind & over & (depth > 0.0)))
     if not any_lane(touches):
         state.ground_live[slot] = 0
