@@ -328,3 +328,11 @@ def test_variants_are_named_once_and_default_to_the_preset() -> None:
     # values of None or of a named body's own stand for the preset too
     assert make_task("hilly", **defaults).identity == make_task("hilly").identity
     assert {"gravity", "window", "observation", "pressure_length", "fitness", "ground_friction"} <= set(names)
+
+
+def test_stepping_needs_agents() -> None:
+    simulator = Simulator(make_task("flat"))
+    with pytest.raises(InvalidInput, match="call reset first"):
+        simulator.step(np.zeros((1, 11)))
+    with pytest.raises(InvalidInput, match="at least 1; got 0"):
+        simulator.reset(0)

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from turgor.body import Body
 from turgor.errors import InvalidInput, describe
 from turgor.variants import Condition
-from turgor.variants import Observation as Observation
 from turgor.variants import Sensing as Sensing
 
 

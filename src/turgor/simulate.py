@@ -96,6 +96,8 @@ class Simulator:
 
     def reset(self, agents: int, position: ArrayLike | None = None) -> Step:
         """Puts `agents` agents at the start, to be driven by `step`; returns their first `Step`."""
+        if not isinstance(agents, int) or agents < 1:
+            raise InvalidInput("agents: expected a whole number, at least 1", describe(agents))
         starts = self._starts(agents, position)
         _load_kernel()
         self._stepping = [_Batch(self._kernel, starts[part]) for part in _parts(agents, self.threads)]
@@ -106,6 +108,8 @@ class Simulator:
     def step(self, commands: ArrayLike) -> Step:
         """One step of all agents after `reset`, with `commands` [agent, output] in place of a controller's outputs:
         springs in [-1, 1], then each chamber's pressure change in units of `Task.pressure_step`."""
+        if not self._stepping:
+            raise InvalidInput("step: expected agents at the start; call reset first")
         agents = sum(batch.agents for batch in self._stepping)
         commands = np.asarray(commands, dtype=np.float32)
         outputs = output_count(self.task.body, self.task.condition)

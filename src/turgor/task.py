@@ -32,7 +32,6 @@ from turgor.variants import (
     Physics,
     variant_names,
 )
-from turgor.variants import PressureLength as PressureLength
 
 REST_GAP = 0.015  # [m] between the lowest corner and the ground at a resting start
 

@@ -168,7 +168,7 @@ def _run_blocks(
                 break
 
 
-# The cache knows `width`, and through it the sources of all that is called here: see lanes.Width. Where no folder can
+# The cache knows `width`, and through it the sources of all that is called here: see memory.Width. Where no folder can
 # be written to, there is no cache.
 _compile = partial(njit, nogil=True, error_model="numpy", boundscheck=False)
 try:
