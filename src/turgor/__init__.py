@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from turgor.evolution.loop import resume as resume
     from turgor.evolution.strategy import CMAES as CMAES
     from turgor.evolution.strategy import Strategy as Strategy
+    from turgor.experiments.reproduce import reproduce as reproduce
     from turgor.recording import Recording as Recording
     from turgor.runs import Run as Run
     from turgor.scene import Scene as Scene
@@ -48,6 +49,7 @@ _HOME = {
     "turgor.errors": ("InvalidInput",),
     "turgor.evolution.loop": ("evaluate", "evolve", "resume"),
     "turgor.evolution.strategy": ("CMAES", "Strategy"),
+    "turgor.experiments.reproduce": ("reproduce",),
     "turgor.recording": ("Recording",),
     "turgor.runs": ("Run",),
     "turgor.scene": ("Scene", "cage", "flat", "hills"),

@@ -99,7 +99,7 @@ class Simulator:
         if not isinstance(agents, int) or agents < 1:
             raise InvalidInput("agents: expected a whole number, at least 1", describe(agents))
         starts = self._starts(agents, position)
-        _load_kernel()
+        load_kernel()
         self._stepping = [_Batch(self._kernel, starts[part]) for part in _parts(agents, self.threads)]
         for batch in self._stepping:
             batch.run(COMMANDS, first=0, steps=0, last=self.task.steps - 1)
@@ -182,7 +182,7 @@ class Simulator:
 
     def _spread(self, run: Callable[[Any], None], parts: list[Any]) -> None:
         """Runs every part, over the threads."""
-        _load_kernel()
+        load_kernel()
         if self.threads == 1 or len(parts) == 1:
             for part in parts:
                 run(part)
@@ -247,7 +247,7 @@ def replay(
         batch.velocity[:] = start_position(velocity, body).astype(np.float32)
     trace = batch.trace(steps)
     acting = np.zeros((steps, body.chamber_count)) if task.pressure is None else task.pressure
-    _load_kernel()
+    load_kernel()
     batch.run(REPLAY, 0, steps, steps - 1, script=np.concatenate([lengths, acting], axis=1), trace=trace)
     return _recording(task, trace)
 
@@ -406,7 +406,7 @@ def _width() -> Width:
 
 
 @lru_cache
-def _load_kernel() -> None:
+def load_kernel() -> None:
     """Has the kernel ready, compiled or from the cache; says so if that takes a while."""
     said = "turgor: compiling the engine for this processor, once ..."
     notice = threading.Timer(1.5, print, [said], {"file": sys.stderr, "flush": True})

@@ -15,6 +15,8 @@ from turgor.errors import InvalidInput
 
 if TYPE_CHECKING:
     from turgor.evolution.loop import Progress
+    from turgor.experiments.campaign import Progress as Campaign
+    from turgor.experiments.measure import Measured
 
 LINE_INTERVAL = 2.0  # [s], between lines of progress in a pipe
 LIVE_INTERVAL = 0.1  # [s], between redraws on a terminal
@@ -177,6 +179,63 @@ class ProgressDisplay:
         elif last or now - self._shown > LINE_INTERVAL:
             say(text)
             self._shown = now
+
+
+class CampaignDisplay:
+    """Shows the `Progress` of a campaign: a bar for every run under way and one for all, above them a line for each
+    that is finished; in a pipe the lines alone."""
+
+    def __init__(self) -> None:
+        self._bars: Any = None
+        self._tasks: dict[str, Any] = {}
+        self._whole: Any = None
+
+    def __enter__(self) -> CampaignDisplay:
+        if sys.stdout.isatty():
+            from rich.progress import BarColumn, TextColumn
+            from rich.progress import Progress as Bars
+
+            self._bars = Bars(BarColumn(bar_width=14), TextColumn("{task.description}"), auto_refresh=False)
+            self._whole = self._bars.add_task("starting ...", total=None)
+            self._bars.start()
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._bars is not None:
+            self._bars.refresh()
+            self._bars.stop()
+
+    def __call__(self, progress: Campaign) -> None:
+        left = "" if progress.seconds_left is None else f"  {_clock(progress.seconds_left)} left"
+        if progress.finished is not None:
+            self._say(f"[{progress.done}/{progress.total}] {_outcome(progress.finished)}", left)
+        if self._bars is None:
+            return
+        for name in [name for name in self._tasks if name not in progress.running]:
+            self._bars.remove_task(self._tasks.pop(name))
+        for name, (done, budget, best) in progress.running.items():
+            if name not in self._tasks:
+                self._tasks[name] = self._bars.add_task(name, total=budget)
+            text = f"{name}  {done:,}/{budget:,}  best {best:.3f}"
+            self._bars.update(self._tasks[name], completed=done, description=text)
+        waiting = progress.total - progress.done - len(progress.running)
+        text = f"{progress.done} of {progress.total} done, {waiting} waiting{left}"
+        self._bars.update(self._whole, completed=progress.done, total=progress.total, description=text)
+        self._bars.refresh()
+
+    def _say(self, text: str, left: str) -> None:
+        if self._bars is None:
+            say(text + left)
+        else:
+            self._bars.console.print(text, markup=False, highlight=False)
+
+
+def _outcome(measured: Measured) -> str:
+    champion = measured.champion
+    text = f"{champion.run}  best {champion.best:.3f}  robust {champion.robust:.3f} m/s"
+    if champion.solved_starts is not None:
+        text += f"  escapes {champion.solved_starts}/{champion.starts}"
+    return text + (f"  {measured.seconds['total']:.1f} s" if measured.seconds else "")
 
 
 def _clock(seconds: float) -> str:

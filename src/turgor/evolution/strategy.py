@@ -94,7 +94,7 @@ class CMAES:
         """
         if parameter_count < 1:
             raise InvalidInput("evolve: expected a task with something to evolve", "a controller without parameters")
-        population = 4 + math.floor(3 * math.log(parameter_count)) if population is None else population
+        population = default_population(parameter_count) if population is None else population
         if not isinstance(population, int) or population < 4:
             raise InvalidInput("population: expected a whole number, at least 4", describe(population))
         if not (math.isfinite(sigma) and sigma > 0):
@@ -193,6 +193,11 @@ class CMAES:
         condition = float(evolution.sm.D[-1] / evolution.sm.D[0]) ** 2
         if condition > LARGEST_CONDITION:
             raise Degenerate(f"its covariance's condition number is {condition:.0e}, too large for float64")
+
+
+def default_population(parameter_count: int) -> int:
+    """Agents in a generation: 4 + floor(3 ln N) (Hansen, "The CMA Evolution Strategy: A Tutorial", 2016)."""
+    return 4 + math.floor(3 * math.log(parameter_count))
 
 
 def _put(part: Any, state: dict[str, np.ndarray], names: tuple[str, ...]) -> None:

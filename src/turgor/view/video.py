@@ -41,12 +41,15 @@ def write_video(
     stop: float | None = None,
     title: str = "",
     pressure_range: tuple[float, float] | None = None,
+    crf: int | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Path:
     """Path of the video of `recording` from `start` to `stop` [s], both included; None: to the end.
 
     The suffix chooses the format: .mp4 (H.264) or .webm (VP9). A frame shows the step nearest to its time: at
-    60 frames/s and dt = 1/60 s, one frame a step. `progress(done, total)` is called after each frame.
+    60 frames/s and dt = 1/60 s, one frame a step. `crf` is the encoder's constant rate factor: the higher, the smaller
+    the file and the coarser the picture (None: 20 for H.264, 32 for VP9). `progress(done, total)` is called after
+    each frame.
     The file appears under its name once it is whole. Raises `InvalidInput`.
     """
     path = Path(path)
@@ -56,12 +59,14 @@ def write_video(
         raise InvalidInput("path: expected a file in a folder that exists", describe(path))
     if any(n % 2 for n in checked_size(size)):
         raise InvalidInput("size: expected an even width and height for video", describe(size))
+    if crf is not None and not (isinstance(crf, int) and 0 <= crf <= 51):
+        raise InvalidInput("crf: expected a whole number from 0 to 51", describe(crf))
     steps = frame_steps(recording, fps, start, stop)
     painter = Painter(recording, size, title, pressure_range=pressure_range)
     # av knows the format by the suffix
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
-        _encode(painter, steps, partial, fps, progress)
+        _encode(painter, steps, partial, fps, crf, progress)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
@@ -87,6 +92,7 @@ def _encode(
     steps: list[int],
     path: Path,
     fps: float,
+    crf: int | None,
     progress: Callable[[int, int], object] | None,
 ) -> None:
     """Draws in this thread while another encodes the picture before."""
@@ -94,6 +100,8 @@ def _encode(
     from av.video.reformatter import Colorspace
 
     codec, options, container_options = FORMATS[path.suffix.lower()]
+    if crf is not None:
+        options = {**options, "crf": str(crf)}
     rate = Fraction(fps).limit_denominator(1001)
     pictures = [av.VideoFrame(*painter.size, PIXELS) for _ in range(2)]
     with av.open(str(path), "w", options=container_options) as container:
