@@ -77,7 +77,7 @@ def draw_inflation(tables: Tables) -> Drawing | None:
     return Drawing(
         "inflation",
         "A body under pressure",
-        "Left: area ratio rho = area / (pi r^2) and prescribed pressure over time in the author's inflation test, one "
+        "Left: area ratio ρ = area / (π r²) and prescribed pressure over time in the author's inflation test, one "
         "body of each size; colour: the amount of gas of the published program; grey, dashed: the 0.1 kg of gas that "
         "the text prints. "
         "Right: area ratio while the pressure rises so slowly that the body stays in balance on the ground under "

@@ -3,7 +3,7 @@
 FOLDER/hilly-small-pressure-s0/ ...    a run each
 FOLDER/tables/*.csv                    what was found
 FOLDER/figures/*.svg, .pdf, .png
-FOLDER/videos/*.mp4                    the most robust champion of each cell
+FOLDER/videos/*.mp4                    the most reliable champion of each cell
 FOLDER/report.html                     all of it
 """
 
@@ -135,10 +135,11 @@ def _find_tables(measured: Sequence[Measured], inflated: Sequence[str]) -> Table
 
 
 def _films(measured: Sequence[Measured], folder: Path, threads: int | None, say: Callable[[str], object]) -> list[Film]:
-    """A video of the most robust champion of each cell of rq1 and rq2 that evolved."""
+    """A video of the champion of each cell of rq1 and rq2 that escapes, or else moves, most reliably."""
     by_name = {m.entry.name: m for m in measured}
     cells = by_cell(m.champion for m in measured if m.entry.evaluations and not m.entry.change)
-    chosen = [by_name[max(found, key=lambda c: c.robust).run] for found in cells.values()]
+    best = [max(found, key=lambda c: (c.solved_starts or 0, bool(c.solved), c.robust)) for found in cells.values()]
+    chosen = [by_name[champion.run] for champion in best]
     if not chosen:
         return []
     say(f"{len(chosen)} videos ...")
