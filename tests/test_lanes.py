@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numba import njit, typeof
 
-from turgor.physics.lanes import any_lane, lane_bits, lowest_bit, select, select_mask
+from turgor.physics.lanes import any_lane, highest, lane_bits, lowest_bit, select, select_mask
 from turgor.physics.memory import (
     BYTES,
     FIELD,
@@ -307,6 +307,25 @@ def test_comparisons_and_masks(memory: Arrays) -> None:
     for at, values in enumerate(chosen):
         same_bits(memory.out[at : 4 * ROWS : 4], values)
     np.testing.assert_array_equal(memory.whole[:ROWS], np.where(less, i, k))
+
+
+@compiled
+def largest_of_rows(buffer, offsets, width):
+    m = views(Memory, buffer, offsets, width)
+    for r in range(ROWS):
+        m.numbers[0] = highest(m.a[r])
+        m.out[r] = fill(m.out, m.numbers[0])
+
+
+def test_highest_leaves_nan_out(memory: Arrays) -> None:
+    numbers = np.random.default_rng(3).normal(size=memory.a.shape).astype(F)
+    memory.a[:] = numbers
+    memory.a[3] = np.nan
+    for r in range(4, ROWS):  # every lane once
+        memory.a[r, r % int(memory.width)] = np.nan if r % 2 else 9.0
+    expected = np.where(np.isnan(memory.a), -np.inf, memory.a).max(axis=1)
+    memory.run(largest_of_rows)
+    np.testing.assert_array_equal(memory.out[:ROWS], np.repeat(expected[:, None], int(memory.width), axis=1))
 
 
 @compiled

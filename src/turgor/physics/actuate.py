@@ -22,12 +22,14 @@ def tanh(x):
 def control(settings, brain, work):
     """command = tanh(W_s o + b_s) for springs, W_p o + b_p for chambers.
 
-    Two outputs at a time share the loads of o; two sums each hide the latency of the additions. Their order is fixed.
+    Two outputs at a time share the loads of o, one of each half, so that the weights are read as two unbroken streams;
+    two sums each hide the latency of the additions. Their order is fixed.
     """
     inputs = settings.inputs
     even = inputs - inputs % 2
-    for j in range(0, settings.outputs, 2):
-        last = min(j + 1, settings.outputs - 1)  # an odd number of outputs: the last one twice
+    half = (settings.outputs + 1) // 2
+    for j in range(half):
+        last = min(j + half, settings.outputs - 1)  # an odd number of outputs: the last one twice
         at = j * inputs
         twin = last * inputs
         a = brain.bias[j]

@@ -138,14 +138,15 @@ def recall(new, old0, impulse0, old1, impulse1):
 @rare
 def enter_columns(settings, model, state, work, i, lanes):
     """Copies the column that mass i is in to each of `lanes` (bits), and takes along the impulses of the segments
-    that the old column had too."""
+    that the old column had too. A slot whose segment stays is left as it is."""
     reach = model.extent[i] + 1.4143 * settings.reach + MARGIN
     slots = settings.slots
     first = i * slots
     while lanes != 0:
         lane = lowest_bit(lanes)
         lanes = lanes & (lanes - 1)
-        cell = find_column(settings, model, state.x[i, lane])
+        cell = find_column(settings, model, state.x[i, lane], state.cell[i, lane])
+        state.cell[i, lane] = cell
         state.left[i, lane] = model.column[cell]
         state.right[i, lane] = model.column[cell + 1]
         state.floor[i, lane] = model.floor[cell] + reach
@@ -153,7 +154,9 @@ def enter_columns(settings, model, state, work, i, lanes):
         state.listed[i, lane] = model.listed[cell]
         carry_impulses(settings, state, work, first, lane)
         for k in range(slots):
-            fill_slot(settings, model, state, work, i, k, lane, model.candidate[cell * slots + k])
+            segment = model.candidate[cell * slots + k]
+            if segment != state.segment[first + k, lane]:
+                fill_slot(settings, model, state, work, i, k, lane, segment)
     used = 0
     for lane in range(settings.lanes):
         used = max(used, state.listed[i, lane])
@@ -163,17 +166,13 @@ def enter_columns(settings, model, state, work, i, lanes):
 
 
 @inlined
-def find_column(settings, model, x):
-    """The column that holds x."""
-    low = 0
-    high = settings.columns
-    while high - low > 1:
-        middle = (low + high) // 2
-        if x >= model.column[middle]:
-            low = middle
-        else:
-            high = middle
-    return low
+def find_column(settings, model, x, cell):
+    """The column that holds x, looked for from `cell` on: mostly its neighbour."""
+    while cell + 1 < settings.columns and x >= model.column[cell + 1]:
+        cell += 1
+    while cell > 0 and x < model.column[cell]:
+        cell -= 1
+    return cell
 
 
 @inlined
@@ -278,11 +277,18 @@ def find_pair_contacts(settings, model, state, work):
 
 @stage
 def note_travel(settings, state, work, t):
-    """How much the distance of any two masses can have changed in step t is added to `travel`."""
-    most = fill(state.x, 0.0)
-    for i in range(settings.masses):
-        most = max(max(abs(work.dx[i]), abs(work.dy[i])), most)
-    state.travel[0] += 2.0 * highest(most)
+    """How much the distance of any two masses can have changed in step t, in x or in y, is added to `travel`: what
+    they have moved together does not count."""
+    left = work.dx[0]
+    right = left
+    down = work.dy[0]
+    up = down
+    for i in range(1, settings.masses):
+        left = min(work.dx[i], left)
+        right = max(work.dx[i], right)
+        down = min(work.dy[i], down)
+        up = max(work.dy[i], up)
+    state.travel[0] += highest(max(right - left, up - down))
     if t % LOOK_AGAIN == 0:
         state.travel[0] = 0.0
         for p in range(settings.pairs):

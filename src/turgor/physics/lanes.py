@@ -215,12 +215,20 @@ def any_lane(typingctx: Any, mask: Any) -> Any:
 
 @intrinsic
 def highest(typingctx: Any, value: Any) -> Any:
-    """The largest number of all lanes: one float32. Only for decisions that no lane's result depends on."""
+    """The largest number of all lanes but NaN: one float32. Only for decisions that no lane's result depends on."""
 
     def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-        kind = ir.FunctionType(ir.FloatType(), [value.llvm])
-        name = f"llvm.vector.reduce.fmax.v{value.width}f32"
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), values)
+        lowest = as_lanes(context, builder, ir.Constant(ir.FloatType(), -math.inf), types.float32, value)
+        best = builder.select(builder.fcmp_ordered("==", values[0], values[0]), values[0], lowest)
+        half = value.width // 2
+        # one half against the other, and again: LLVM's own reduction, without fast-math, is a chain of single numbers
+        while half:
+            places = ir.VectorType(ir.IntType(32), half)
+            low = builder.shuffle_vector(best, best, ir.Constant(places, [*range(half)]))
+            high = builder.shuffle_vector(best, best, ir.Constant(places, [*range(half, 2 * half)]))
+            best = builder.select(builder.fcmp_ordered(">", low, high), low, high)
+            half //= 2
+        return builder.extract_element(best, ir.IntType(32)(0))
 
     return types.float32(value), emit
 

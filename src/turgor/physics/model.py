@@ -13,6 +13,7 @@ from turgor.physics.memory import Floats, FloatTable, Ints, IntTable
 
 WIDTH = 16  # agents in a block: one AVX-512 vector; see ARCHITECTURE.md
 NOWHERE = -1
+UNKNOWN = -2  # a slot that has not been filled yet
 LOOK_AGAIN = 64  # [step], after which all pairs are looked at, so that `travel` gathers no rounding errors
 # [m], slack of the search for candidates over the exact tests, against rounding. A candidate search that misses a
 # contact shows as an agent that depends on its neighbours: shapes are apart when they are `2 skin` apart along the
@@ -130,6 +131,7 @@ class State(NamedTuple):
     window: Annotated[Floats, "window"]  # [window, input], the last observations
     total: Annotated[Floats, "input"]  # their sum
     # the column that each mass is in, copied to the lanes: [mass]
+    cell: Annotated[Ints, "mass"]  # its index
     left: Annotated[Floats, "mass"]  # [m]
     right: Annotated[Floats, "mass"]
     floor: Annotated[Floats, "mass"]

@@ -11,7 +11,7 @@ from turgor.physics.memory import lane_count, views
 from turgor.physics.model import (
     COMMANDS,
     CONTROLLER,
-    NOWHERE,
+    UNKNOWN,
     Brain,
     Model,
     Result,
@@ -64,6 +64,7 @@ def begin(settings, model, state, work, result, position, velocity, first, width
             state.vx[i, lane] = velocity[first + lane, i, 0]
             state.vy[i, lane] = velocity[first + lane, i, 1]
             state.listed[i, lane] = 0
+            state.cell[i, lane] = 0
         state.touch[i] = 0.0
         # outside any column, so that the first step looks its column up
         state.left[i] = 1e30
@@ -81,7 +82,7 @@ def begin(settings, model, state, work, result, position, velocity, first, width
     for slot in range(settings.masses * settings.slots):
         state.ground_live[slot] = 0
         for lane in range(lane_count(width)):
-            state.segment[slot, lane] = NOWHERE
+            state.segment[slot, lane] = UNKNOWN
     for p in range(settings.pairs):
         state.pair_live[p] = 0
         state.wake[p] = 0.0
