@@ -114,7 +114,11 @@ _stop: Any = None
 def _begin(reports: Any, stop: Any) -> None:
     global _reports, _stop
     _reports, _stop = reports, stop
-    # Ctrl-C reaches every process of the terminal: the first one decides
+    ignore_interrupts()
+
+
+def ignore_interrupts() -> None:
+    """Ctrl-C reaches every process of a terminal: the first one decides."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -9,10 +9,12 @@ FOLDER/report.html                     all of it
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import multiprocessing
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ import msgspec
 
 from turgor.errors import InvalidInput, describe
 from turgor.experiments.analysis import by_cell, compare, find_curves, find_effects
-from turgor.experiments.campaign import Progress, run_entries
+from turgor.experiments.campaign import Progress, ignore_interrupts, run_entries
 from turgor.experiments.claims import check_claims
 from turgor.experiments.figures import draw_figures
 from turgor.experiments.inflation import author_protocol, quasi_static
@@ -71,13 +73,13 @@ def reproduce(
     load_kernel()  # compiles it, if it has to be, before every process would
     measured = run_entries(folder, entries, threads, progress)
 
-    say("inflation, statistics, tables ...")
-    tables = _find_tables(measured, [b for b in BODIES if b in bodies] if "rq0" in questions else [])
-    write_tables(folder / "tables", tables)
-    say("figures ...")
-    recordings = {m.entry.name: record(m) for m in measured if m.entry.question == "rq1"}
-    figures = draw_figures(tables, recordings, folder / "figures")
-    films = _films(measured, folder / "videos", threads, say) if videos else []
+    with _drawers(threads) as pool:
+        films = [pool.submit(_film, m, folder / "videos") for m in _chosen(measured)] if videos else []
+        say(f"inflation, statistics, tables, figures{f', {len(films)} videos' if films else ''} ...")
+        tables = _find_tables(measured, [b for b in BODIES if b in bodies] if "rq0" in questions else [])
+        write_tables(folder / "tables", tables)
+        recordings = {m.entry.name: record(m) for m in measured if m.entry.question == "rq1"}
+        figures = draw_figures(tables, recordings, folder / "figures")
     method = Method(
         settings={
             "questions": list(questions),
@@ -93,7 +95,7 @@ def reproduce(
         wall=time.perf_counter() - began,
         made=datetime.date.today().isoformat(),
     )
-    return write_report(folder / "report.html", tables, figures, films, method)
+    return write_report(folder / "report.html", tables, figures, [film.result() for film in films], method)
 
 
 def record(measured: Measured) -> Recording:
@@ -134,23 +136,30 @@ def _find_tables(measured: Sequence[Measured], inflated: Sequence[str]) -> Table
     )
 
 
-def _films(measured: Sequence[Measured], folder: Path, threads: int | None, say: Callable[[str], object]) -> list[Film]:
-    """A video of the champion of each cell of rq1 and rq2 that escapes, or else moves, most reliably."""
+def _chosen(measured: Sequence[Measured]) -> list[Measured]:
+    """The champion of each cell of rq1 and rq2 that escapes, or else moves, most reliably."""
     by_name = {m.entry.name: m for m in measured}
     cells = by_cell(m.champion for m in measured if m.entry.evaluations and not m.entry.change)
     best = [max(found, key=lambda c: (c.solved_starts or 0, bool(c.solved), c.robust)) for found in cells.values()]
-    chosen = [by_name[champion.run] for champion in best]
-    if not chosen:
-        return []
-    say(f"{len(chosen)} videos ...")
-    folder.mkdir(exist_ok=True)
-    with ThreadPoolExecutor(threads or available_cores()) as pool:
-        return list(pool.map(lambda m: _film(m, folder), chosen))
+    return [by_name[champion.run] for champion in best]
+
+
+@contextlib.contextmanager
+def _drawers(processes: int | None) -> Generator[ProcessPoolExecutor]:
+    """Processes for what takes long to draw; whatever ends the block ends them."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes or available_cores(), context, ignore_interrupts) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _film(measured: Measured, folder: Path) -> Film:
     champion = measured.champion
     title = f"{champion.task}, {champion.body}, {champion.condition}, seed {champion.seed}: {champion.best:.2f} m/s"
+    folder.mkdir(exist_ok=True)
     path = folder / f"{champion.run}.mp4"
     write_video(record(measured), path, title=title, **FILM)
     return Film(run=champion.run, title=title, path=path)
