@@ -63,6 +63,23 @@ def test_it_maximises() -> None:
     assert slope(generations(strategy, 200)[-1]).max() > -1e-3
 
 
+@pytest.mark.parametrize("parameters", [5, 120])
+def test_it_is_the_algorithm_that_pycma_runs(parameters: int) -> None:
+    """Its own update and decomposition change nothing but the rounding."""
+    ours = CMAES(parameters, np.random.default_rng(0))
+    theirs = CMAES(parameters, np.random.default_rng(0))
+    del theirs._evolution.sm.update  # the method of its class again
+    theirs._evolution.sm.eigenmethod = np.linalg.eigh
+    for _ in range(40):
+        theta, same = ours.ask(), theirs.ask()
+        np.testing.assert_allclose(theta, same, rtol=0, atol=1e-7)
+        fitness = -(theta**2 * np.linspace(1, 5, parameters)).sum(axis=1)
+        ours.tell(theta, fitness)
+        theirs.tell(same, fitness)
+        np.testing.assert_allclose(ours._evolution.sm.C, theirs._evolution.sm.C, rtol=0, atol=1e-8)
+    assert ours._evolution.sm.count_eigen == theirs._evolution.sm.count_eigen > 1
+
+
 def test_seed_decides_every_bit_and_the_global_generator_stays_as_it_is() -> None:
     np.random.seed(7)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # noqa: NPY002
