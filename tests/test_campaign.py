@@ -15,7 +15,7 @@ from turgor.errors import InvalidInput
 from turgor.evolution.loop import evaluate
 from turgor.experiments import rows
 from turgor.experiments.analysis import by_cell, find_curves
-from turgor.experiments.campaign import Progress, open_run, run_entries
+from turgor.experiments.campaign import Progress, Schedule, open_run, run_entries, share_done
 from turgor.experiments.measure import STARTS, measure
 from turgor.experiments.plan import CHANGES, Entry, make_plan
 from turgor.runs import Run
@@ -88,6 +88,22 @@ def test_an_impossible_plan_is_refused(asked, words):
     assert str(error.value) == words
 
 
+def test_the_schedule_pairs_long_with_short_and_ends_with_the_shortest():
+    entries = [small(seed=k) for k in range(20)]
+    schedule = Schedule({entry: float(entry.seed) for entry in entries}, 2)
+    first, second = schedule.start(), schedule.start()
+    assert (first.seed, second.seed) == (19, 6)  # six of the shortest are kept
+    schedule.end(second)
+    assert schedule.start().seed == 7
+    schedule.end(first)
+    assert schedule.start().seed == 18
+    rest = []
+    while (entry := schedule.start()) is not None:
+        rest.append(entry.seed)
+    assert sorted([*rest, 19, 6, 7, 18]) == list(range(20))
+    assert rest[-6:] == [5, 4, 3, 2, 1, 0]
+
+
 # --- many runs ----------------------------------------------------------------------------------------------------
 
 
@@ -143,6 +159,12 @@ def test_finished_runs_are_not_run_again(ran):
     again = run_entries(folder, entries, 1)
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.*")} == before
     assert [m.champion for m in again] == [m.champion for m in measured]
+
+
+def test_what_is_done_counts_for_the_time_left(ran):
+    folder, entries, *_ = ran
+    assert [share_done(folder, entry) for entry in entries] == [1.0, 1.0, 1.0, 0.0]
+    assert share_done(folder, small(seed=9)) == 0.0
 
 
 def test_a_passive_body_is_measured_without_a_run(ran):

@@ -11,7 +11,7 @@ import multiprocessing
 import queue
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -55,20 +55,16 @@ def run_entries(
     """
     if workers is not None and (not isinstance(workers, int) or workers < 1):
         raise InvalidInput("workers: expected a whole number, at least 1", describe(workers))
-    for entry in entries:
-        open_run(folder, entry)  # refuses before anything is done
+    shares = {entry: share_done(folder, entry) for entry in entries}  # refuses before anything is run
+    costs = {entry: cost(entry) * (1 - share) for entry, share in shares.items()}
     if not entries:
         return []
     context = multiprocessing.get_context("spawn")
     reports, stop = context.Queue(), context.Event()
     count = min(workers or available_cores(), len(entries))
-    display = _Display(entries, count, progress)
-    # the longest first, so that the cores end together
-    order = sorted(entries, key=lambda entry: -cost(entry))
     with ProcessPoolExecutor(count, context, _begin, (reports, stop)) as pool:
-        futures = {pool.submit(_work, folder, entry): entry for entry in order}
         try:
-            return _gather(entries, futures, reports, display)
+            found = _gather(folder, Schedule(costs, count), pool, count, reports, _Display(shares, progress))
         except BaseException as error:
             stop.set()
             pool.shutdown(cancel_futures=True)
@@ -77,11 +73,47 @@ def run_entries(
                     f"{folder}: a process of the campaign was ended from outside (memory?); start again to go on"
                 ) from None
             raise
+    return [found[entry] for entry in entries]
 
 
 def cost(entry: Entry) -> float:
     """How long an entry takes, in units of its own."""
     return entry.evaluations * entry.make_task().parameter_count ** 1.2 + 1
+
+
+def share_done(folder: Path, entry: Entry) -> float:
+    """How much of an entry's evolution earlier sessions did [1]. Raises `InvalidInput` as `open_run` does."""
+    run = open_run(folder, entry)
+    return 0.0 if run is None else min(run.evaluations / entry.evaluations, 1.0)
+
+
+class Schedule:
+    """The order in which entries are run.
+
+    Half of the processes take the longest entry that waits, the others the shortest: then the large matrices of one
+    optimizer share memory and cache with another run's simulation rather than with matrices as large. A few of the
+    shortest are kept for the end, so that the processes end together.
+    """
+
+    def __init__(self, costs: Mapping[Entry, float], processes: int) -> None:
+        self._waiting = sorted(costs, key=lambda entry: -costs[entry])
+        self._from_the_top = (processes + 1) // 2
+        self._kept = 3 * processes
+        self._long: set[Entry] = set()  # under way, from the long end
+
+    def start(self) -> Entry | None:
+        """The entry that is to be started next; None where none waits."""
+        if not self._waiting:
+            return None
+        if len(self._long) < self._from_the_top:
+            entry = self._waiting.pop(0)
+            self._long.add(entry)
+            return entry
+        return self._waiting.pop(max(len(self._waiting) - 1 - self._kept, 0))
+
+    def end(self, entry: Entry) -> None:
+        """Notes that an entry has ended."""
+        self._long.discard(entry)
 
 
 def open_run(folder: Path, entry: Entry) -> Run | None:
@@ -160,40 +192,51 @@ class _Reporter:
 
 
 def _gather(
-    entries: Sequence[Entry], futures: dict[Future[Measured], Entry], reports: Any, display: _Display
-) -> list[Measured]:
-    waiting, found = set(futures), {}
-    while waiting:
+    folder: Path, schedule: Schedule, pool: ProcessPoolExecutor, count: int, reports: Any, display: _Display
+) -> dict[Entry, Measured]:
+    """Keeps every process of the pool at work until no entry waits."""
+    running: dict[Future[Measured], Entry] = {}
+    found: dict[Entry, Measured] = {}
+
+    def start() -> None:
+        if (entry := schedule.start()) is not None:
+            future = pool.submit(_work, folder, entry)
+            running[future] = entry
+            future.add_done_callback(lambda _: reports.put(None))  # wakes the loop
+
+    for _ in range(count):
+        start()
+    while running:
         with contextlib.suppress(queue.Empty):
-            display.note(*reports.get(timeout=REPORT_INTERVAL))
-        for future in [f for f in waiting if f.done()]:
-            waiting.discard(future)
-            entry = futures[future]
+            if (report := reports.get(timeout=REPORT_INTERVAL)) is not None:
+                display.note(*report)
+        for future in [future for future in running if future.done()]:
+            entry = running.pop(future)
+            schedule.end(entry)
             found[entry] = future.result()
+            start()
             display.finish(entry, found[entry])
-    return [found[entry] for entry in entries]
+    return found
 
 
 class _Display:
     """Turns what the processes tell into `Progress`."""
 
-    def __init__(self, entries: Sequence[Entry], workers: int, show: Callable[[Progress], object] | None) -> None:
-        self._cost = {entry.name: cost(entry) for entry in entries}
-        self._share = dict.fromkeys(self._cost, 0.0)  # done of each
-        self._first: dict[str, float] = {}  # share when first heard of: done in an earlier session
+    def __init__(self, shares: Mapping[Entry, float], show: Callable[[Progress], object] | None) -> None:
+        self._cost = {entry.name: cost(entry) for entry in shares}
+        self._share = {entry.name: share for entry, share in shares.items()}  # done of each
+        self._first = dict(self._share)  # done in earlier sessions
         self._running: dict[str, tuple[int, int, float]] = {}
         self._done, self._show, self._began = 0, show, time.monotonic()
 
     def note(self, name: str, evaluations: int, budget: int, best: float) -> None:
-        if self._share[name] == 1:
+        if self._share[name] == 1:  # told before its end, heard after it
             return
         self._share[name] = min(evaluations / budget, 0.999)
-        self._first.setdefault(name, self._share[name])
         self._running[name] = evaluations, budget, best
         self._tell(None)
 
     def finish(self, entry: Entry, measured: Measured) -> None:
-        self._first.setdefault(entry.name, 1.0)
         self._share[entry.name] = 1.0
         self._running.pop(entry.name, None)
         self._done += 1
@@ -202,7 +245,7 @@ class _Display:
     def _tell(self, finished: Measured | None) -> None:
         if self._show is None:
             return
-        work = sum(self._cost[n] * (self._share[n] - self._first[n]) for n in self._first)
+        work = sum(self._cost[n] * (share - self._first[n]) for n, share in self._share.items())
         left = sum(self._cost[n] * (1 - share) for n, share in self._share.items())
         seconds = left * (time.monotonic() - self._began) / work if work > 0 else None
         self._show(
