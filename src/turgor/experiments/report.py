@@ -7,25 +7,34 @@ made from the rows.
 
 from __future__ import annotations
 
-import base64
-import re
 import statistics
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from fractions import Fraction
-from functools import cache
 from html import escape
-from itertools import groupby
 from pathlib import Path
-from string import Template
-from typing import TYPE_CHECKING, Any, NamedTuple
-from urllib.parse import quote
-from xml.etree import ElementTree
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from turgor.experiments.analysis import by_cell
 from turgor.experiments.claims import AT_REST, SHARE_RELIABLE
+from turgor.experiments.page import (
+    Cells,
+    counted,
+    data_uri,
+    each_of,
+    first_frame,
+    folded,
+    in_digits,
+    in_minutes,
+    in_words,
+    inline_svg,
+    links_to,
+    listed,
+    make_table,
+    prose,
+    told_facts,
+)
 from turgor.experiments.plan import QUESTIONS
 from turgor.experiments.rows import KINDS, Champion, Comparison, Tables
 from turgor.experiments.statistics import magnitude, smallest_p
@@ -34,9 +43,7 @@ from turgor.runs import write_whole
 if TYPE_CHECKING:
     from turgor.experiments.sheets import Figure
 
-SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 PLACES = {"inflation": "rq0", "hilly": "rq1", "terrains": "rq1", "escape": "rq2", "effects": "studies"}  # of figures
-Cells = dict[str, Any]  # one row of a table, by field
 
 
 class Film(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,15 +63,6 @@ class Method(msgspec.Struct, frozen=True, kw_only=True):
     seconds: dict[str, float]  # run: wall time [s]
     wall: float  # of the whole command this time [s]
     made: str  # date, ISO
-
-
-class Column(NamedTuple):
-    """A column of a table."""
-
-    field: str
-    form: str  # of its numbers, as in ".2f"; "p": a p-value; empty: text
-    head: str  # HTML
-    group: str  # heading over neighbours that share it; empty: none
 
 
 def write_report(path: Path, tables: Tables, figures: Sequence[Figure], films: Sequence[Film], method: Method) -> Path:
@@ -88,7 +86,7 @@ def write_report(path: Path, tables: Tables, figures: Sequence[Figure], films: S
     body = "".join(
         f'<section id="{name}">\n<h2>{title}</h2>\n{content}</section>\n' for name, (title, content) in sections.items()
     )
-    page = _prose(
+    page = prose(
         "page",
         style=Path(__file__).with_name("report.css").read_text(encoding="utf-8"),
         version=escape(method.versions.get("turgor", "")),
@@ -106,71 +104,58 @@ def _title(question: str) -> str:
     return f"Side studies: {words}" if question == "studies" else f"{question.upper()}: {words}"
 
 
-@cache
-def _parts() -> dict[str, Template]:
-    """The parts of `report.html` by name."""
-    text = Path(__file__).with_name("report.html").read_text(encoding="utf-8")
-    names, parts = re.findall(r"<!-- ([\w-]+) -->", text), re.split(r"<!-- [\w-]+ -->\n", text)[1:]
-    return {name: Template(part.rstrip() + "\n") for name, part in zip(names, parts, strict=True)}
-
-
-def _prose(part: str, **words: str) -> str:
-    """A part of `report.html`, with HTML in the place of its $words."""
-    return _parts()[part].substitute(words)
-
-
 # --- findings in words, each made from the rows -------------------------------------------------------------------
 
 
 def _summary(tables: Tables) -> str:
     words = []
     if evolved := [c for c in tables.champions if c.evaluations]:
-        starts = _listed(sorted({str(c.starts) for c in evolved}))
+        starts = listed(sorted({str(c.starts) for c in evolved}))
         words.append(
-            f"{_count(len(evolved), 'evolution')} took {sum(c.evaluations for c in evolved):,} evaluations; every "
+            f"{counted(len(evolved), 'evolution')} took {sum(c.evaluations for c in evolved):,} evaluations; every "
             f"champion ran again from {starts} starts moved by a millionth of a metre (robust fitness)."
         )
     if filled := {body: rho for (body, gas), rho in _at_rest(tables).items() if gas == "author"}:
-        words.append(f"Under full pressure the area is {_each(filled)} of the circle's.")
+        words.append(f"Under full pressure the area is {each_of(filled)} of the circle's.")
     if locomotion := _by_condition(tables, "rq1"):
         medians = [
-            f"{_each({body: statistics.median(c.robust for c in found) for body, found in bodies.items()})} "
+            f"{each_of({body: statistics.median(c.robust for c in found) for body, found in bodies.items()})} "
             + _when(condition)
             for condition, bodies in locomotion.items()
         ]
         words.append(f"The median robust fitness on hilly ground in m/s is {'; '.join(medians)}.")
     escapes = [
-        f"{sum(bool(c.solved) for c in found)} of {_count(len(found), 'champion')} {_when(condition)} ("
+        f"{sum(bool(c.solved) for c in found)} of {counted(len(found), 'champion')} {_when(condition)} ("
         f"{sum(map(_reliable, found))} from at least half of the moved starts)"
         for condition, bodies in _by_condition(tables, "rq2").items()
         if (found := [c for c in _all(bodies) if c.evaluations])
     ]
     if escapes:
-        words.append(f"The cage was left by {_listed(escapes)}.")
+        words.append(f"The cage was left by {listed(escapes)}.")
     if tables.claims:
         kinds = Counter(_kind(claim.verdict) for claim in tables.claims)
         names = {"yes": "holding", "partly": "holding in part", "no": "not holding", "open": "not decided"}
-        told = _listed(f"{kinds[kind]} {name}" for kind, name in names.items() if kinds[kind])
-        words.append(f"{_count(len(tables.claims), 'claim')} of the paper checked: {told}.")
+        told = listed(f"{kinds[kind]} {name}" for kind, name in names.items() if kinds[kind])
+        words.append(f"{counted(len(tables.claims), 'claim')} of the paper checked: {told}.")
     return " ".join(words) or "Nothing was measured."
 
 
 def _findings(tables: Tables, question: str) -> str:
     """What the question asks, and findings that its tables do not show at a glance; nothing without rows."""
     if question == "rq0" and (tables.inflation or tables.quasistatic):
-        return _prose("rq0")
+        return prose("rq0")
     if question == "studies" and any(c.question == "studies" for c in tables.champions):
-        says = _facts({row.change: row.says for row in tables.effects})
-        return _prose("studies", least=_least((row.count, row.count_paper) for row in tables.effects)) + says
+        says = told_facts({row.change: row.says for row in tables.effects})
+        return prose("studies", least=_least((row.count, row.count_paper) for row in tables.effects)) + says
     found = _by_condition(tables, question)
     if question == "rq1" and found:
-        return _prose("rq1", findings=" ".join(_ahead_of_passive(found)))
+        return prose("rq1", findings=" ".join(_ahead_of_passive(found)))
     if question == "rq2" and found:
         tangled = [
             f"{sum(c.tangled_starts for c in champions):,} of {sum(c.starts for c in champions):,} {_when(condition)}"
             for condition, champions in ((condition, _all(bodies)) for condition, bodies in found.items())
         ]
-        return _prose("rq2", tangled=_listed(tangled))
+        return prose("rq2", tangled=listed(tangled))
     return ""
 
 
@@ -182,10 +167,10 @@ def _ahead_of_passive(found: dict[str, dict[str, list[Champion]]]) -> Iterator[s
         if pairs:
             yield (
                 f"{_when(condition).capitalize()}, {sum(c.robust > still for c, still in pairs)} of "
-                f"{_count(len(pairs), 'champion')} beat the passive body of their terrain (robust fitness)."
+                f"{counted(len(pairs), 'champion')} beat the passive body of their terrain (robust fitness)."
             )
     if passive:
-        yield f"The best passive body reaches {_number(max(passive.values()), '.2f')} m/s."
+        yield f"The best passive body reaches {in_digits(max(passive.values()), '.2f')} m/s."
 
 
 def _reading(tables: Tables) -> str:
@@ -193,10 +178,10 @@ def _reading(tables: Tables) -> str:
     for question in ("rq1", "rq2"):
         excess = [c.best - c.robust for c in tables.champions if c.question == question and c.evaluations]
         if excess:
-            median, most = _number(statistics.median(excess), ".2f"), _number(max(excess), ".2f")
+            median, most = in_digits(statistics.median(excess), ".2f"), in_digits(max(excess), ".2f")
             luck.append(f"by {median} m/s for the median champion of {question.upper()} (at most {most})")
     if luck:
-        items += _prose("luck", luck=_listed(luck))
+        items += prose("luck", luck=listed(luck))
     if tables.comparisons:
         families: dict[tuple[str, str], list[Comparison]] = {}
         for row in tables.comparisons:
@@ -208,7 +193,7 @@ def _reading(tables: Tables) -> str:
         }
         holm = [f"{p:.2g} for the {count} of {question.upper()}" for (question, count), p in least.items()]
         sizes = [(row.count_b, row.count_a) for row in tables.comparisons]
-        items += _prose("tests", least=_least(sizes), least_holm=_listed(holm))
+        items += prose("tests", least=_least(sizes), least_holm=listed(holm))
     return f'<ul class="notes">\n{items}</ul>\n' if items else ""
 
 
@@ -300,7 +285,7 @@ def _inflation(tables: Tables) -> str:
         fields = ("pressure_max", "lift_off", "pressure", "area_ratio", "analytic")
         row = {"body": body, "author": at_rest.get((body, "author")), "text": at_rest.get((body, "text"))}
         rows.append(row | {field: getattr(full, field, None) for field in fields})
-    return _table("inflation", rows, heads=1, seconds=f"{AT_REST:.0f}")
+    return make_table("inflation", rows, heads=1, seconds=f"{AT_REST:.0f}")
 
 
 def _spread(tables: Tables, question: str) -> str:
@@ -321,7 +306,7 @@ def _spread(tables: Tables, question: str) -> str:
             row["tangled"] = sum(c.tangled_starts for c in found) / starts
             row["escape_time"] = statistics.median(times) if times else None
         rows.append(row)
-    return _table("cells", rows, question)
+    return make_table("cells", rows, question)
 
 
 def _terrains(tables: Tables) -> str:
@@ -332,93 +317,24 @@ def _terrains(tables: Tables) -> str:
             row = rows.setdefault((c.body, c.seed), {"body": c.body, "seed": c.seed})
             row |= {f"{c.condition}_best": c.best, f"{c.condition}_robust": c.robust}
     bodies = list(dict.fromkeys(c.body for c in tables.champions))
-    return _table("terrains", sorted(rows.values(), key=lambda row: bodies.index(row["body"])))
+    return make_table("terrains", sorted(rows.values(), key=lambda row: bodies.index(row["body"])))
 
 
 def _champions(tables: Tables, question: str) -> str:
     """Seed by seed, with what became of their moved starts."""
     rows = [msgspec.structs.asdict(c) for c in tables.champions if c.question == question]
     first = "change Change\ntask Task" if question == "studies" else "body Body\ncondition Condition"
-    return _folded("Champions seed by seed", _table("champions", rows, question, first=first))
+    return folded("Champions seed by seed", make_table("champions", rows, question, first=first))
 
 
 def _comparisons(tables: Tables, question: str) -> str:
     found = [row for row in tables.comparisons if row.question == question]
     rows = [msgspec.structs.asdict(row) | {"magnitude": magnitude(row.effect)} for row in found]
-    return _table("comparisons", rows, question)
+    return make_table("comparisons", rows, question)
 
 
 def _effects(tables: Tables) -> str:
-    return _table("effects", [msgspec.structs.asdict(row) for row in tables.effects])
-
-
-def _table(part: str, rows: Sequence[Cells], question: str = "", heads: int = 2, **words: str) -> str:
-    """The table whose caption and columns are a part of `report.html`, without columns in which no row has anything.
-
-    The first `heads` columns name a row.
-    """
-    if not rows:
-        return ""
-    caption, _, spec = _prose(f"table-{part}", **words).partition("\n")
-    columns = [c for c in _columns(spec) if any(row.get(c.field) is not None for row in rows)]
-    name = f"{question}-{part}" if question else part
-    upper, lower = "", ""
-    for group, members in groupby(columns, key=lambda column: column.group):
-        found = list(members)
-        deep = "" if group else ' rowspan="2"'
-        cells = "".join(f'<th scope="col"{deep}{_align(column)}>{column.head}</th>' for column in found)
-        upper += f'<th scope="colgroup" colspan="{len(found)}">{group}</th>' if group else cells
-        lower += cells if group else ""
-    if not lower:
-        upper = upper.replace(' rowspan="2"', "")
-    body, before = "", None
-    for row in rows:
-        first = row[columns[0].field]
-        body += '<tr class="next">' if heads > 1 and before not in (None, first) else "<tr>"
-        body += "".join(_cell(column, row.get(column.field), k < heads) for k, column in enumerate(columns)) + "</tr>\n"
-        before = first
-    return f"""<div class="scroll" role="region" tabindex="0" aria-labelledby="caption-{name}">
-<table id="table-{name}">
-<caption id="caption-{name}"><span>{caption}</span></caption>
-<thead><tr>{upper}</tr>{f"<tr>{lower}</tr>" if lower else ""}</thead>
-<tbody>
-{body}</tbody>
-</table>
-</div>
-"""
-
-
-def _folded(summary: str, content: str) -> str:
-    return f"<details>\n<summary>{summary}</summary>\n{content}</details>\n" if content else ""
-
-
-def _columns(spec: str) -> list[Column]:
-    """The columns told by lines of `field:form heading`, or of `group | field:form heading | ...`."""
-    columns = []
-    for line in spec.strip().splitlines():
-        parts = [part.strip() for part in line.split("|")]
-        group = parts.pop(0) if len(parts) > 1 else ""
-        for part in parts:
-            name, _, head = part.partition(" ")
-            field, _, form = name.partition(":")
-            columns.append(Column(field, form, head, group))
-    return columns
-
-
-def _cell(column: Column, value: Any, head: bool) -> str:
-    raw = "" if value is None else str(value)  # as in the CSV file
-    if value is None:
-        text = '<span aria-label="none">–</span>'
-    elif isinstance(value, bool):
-        text = "yes" if value else "no"
-    else:
-        text = escape(_number(value, column.form) if column.form else raw)
-    tag = 'th scope="row"' if head else "td"
-    return f'<{tag}{_align(column)} data-field="{column.field}" data-value="{escape(raw)}">{text}</{tag[:2]}>'
-
-
-def _align(column: Column) -> str:
-    return ' class="number"' if column.form else ""
+    return make_table("effects", [msgspec.structs.asdict(row) for row in tables.effects])
 
 
 # --- figures and films --------------------------------------------------------------------------------------------
@@ -426,36 +342,12 @@ def _align(column: Column) -> str:
 
 def _figure(figure: Figure, folder: Path) -> str:
     svg = next(file for file in figure.files if file.suffix == ".svg")
-    links = " · ".join(_links(figure.files, folder))
+    links = " · ".join(links_to(figure.files, folder))
     return f"""<figure id="figure-{figure.name}">
-<div class="card" role="region" tabindex="0" aria-label="{escape(figure.title)}">{_inline(svg, figure)}</div>
+<div class="card" role="region" tabindex="0" aria-label="{escape(figure.title)}">{inline_svg(svg, figure)}</div>
 <figcaption><b>{escape(figure.title)}.</b> {escape(figure.caption)} <span class="links">{links}</span></figcaption>
 </figure>
 """
-
-
-def _inline(path: Path, figure: Figure) -> str:
-    """The SVG file as an element whose ids are its own and whose styles reach nothing else."""
-    ElementTree.register_namespace("", SVG)
-    ElementTree.register_namespace("xlink", XLINK)
-    prefix, scope = f"{figure.name}-", f"#figure-{figure.name} svg"
-    root = ElementTree.parse(path).getroot()
-    for element in list(root.iter()):
-        for child in [c for c in element if c.tag == f"{{{SVG}}}metadata"]:
-            element.remove(child)
-        for name, value in element.attrib.items():
-            if name == "id":
-                value = prefix + value
-            elif name in ("href", f"{{{XLINK}}}href"):
-                value = re.sub("^#", f"#{prefix}", value)
-            element.set(name, re.sub(r"url\((['\"]?)#", rf"url(\1#{prefix}", value))
-        if element.tag == f"{{{SVG}}}style" and element.text:
-            element.text = re.sub(r"(^|\})\s*([^{}@]+)\{", rf"\1 {scope} \2{{", element.text)
-    for name in ("width", "height"):
-        root.attrib.pop(name, None)
-    root.set("role", "img")
-    root.set("aria-label", figure.title)
-    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _films(films: Sequence[Film], tables: Tables, folder: Path) -> str:
@@ -466,45 +358,20 @@ def _films(films: Sequence[Film], tables: Tables, folder: Path) -> str:
 
 
 def _film(film: Film, champion: Champion | None, folder: Path) -> str:
-    poster, width, height = _poster(film.path)
+    poster, width, height = first_frame(film.path)
     words = [escape(film.title)]
     if champion is not None:
-        words.append(f"robust {_number(champion.robust, '.2f')} m/s")
+        words.append(f"robust {in_digits(champion.robust, '.2f')} m/s")
         if champion.solved_starts is not None:
             words.append(f"escapes from {champion.solved_starts} of {champion.starts} moved starts")
-    links = "".join(f' <span class="links">{link}</span>' for link in _links([film.path], folder))
+    links = "".join(f' <span class="links">{link}</span>' for link in links_to([film.path], folder))
     return f"""<figure>
 <video controls loop muted playsinline preload="none" width="{width}" height="{height}"
- aria-label="Film: {escape(film.title)}" poster="{_data("image/jpeg", poster)}"
- src="{_data("video/mp4", film.path.read_bytes())}"></video>
+ aria-label="Film: {escape(film.title)}" poster="{data_uri("image/jpeg", poster)}"
+ src="{data_uri("video/mp4", film.path.read_bytes())}"></video>
 <figcaption>{"; ".join(words)}.{links}</figcaption>
 </figure>
 """
-
-
-def _poster(path: Path) -> tuple[bytes, int, int]:
-    """A JPEG picture from the middle of a film, its width and height."""
-    import av
-
-    with av.open(str(path)) as film:
-        stream = film.streams.video[0]
-        film.seek((stream.duration or 0) // 2, stream=stream)
-        frame = next(film.decode(stream)).reformat(format="yuvj420p")
-    encoder = av.CodecContext.create("mjpeg", "w")
-    encoder.width, encoder.height, encoder.pix_fmt = frame.width, frame.height, "yuvj420p"
-    encoder.time_base = Fraction(1)
-    return b"".join(map(bytes, [*encoder.encode(frame), *encoder.encode(None)])), frame.width, frame.height
-
-
-def _data(kind: str, data: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def _links(files: Iterable[Path], folder: Path) -> list[str]:
-    """Links to those of `files` that lie beneath `folder`."""
-    near = [file for file in files if file.is_file() and file.resolve().is_relative_to(folder.resolve())]
-    paths = [file.resolve().relative_to(folder.resolve()).as_posix() for file in near]
-    return [f'<a href="{quote(path)}">{escape(Path(path).suffix[1:].upper())}</a>' for path in paths]
 
 
 # --- how it was made ----------------------------------------------------------------------------------------------
@@ -514,13 +381,13 @@ def _methods(method: Method) -> str:
     facts = {**method.settings, **method.machine, **method.versions}
     longest = sorted(method.seconds.items(), key=lambda item: -item[1])
     runs = [{"run": run, "seconds": seconds} for run, seconds in longest]
-    together = f" Its {_count(len(runs), 'run')} took {_duration(sum(method.seconds.values()))} in all, a core each."
-    return _prose(
+    together = f" Its {counted(len(runs), 'run')} took {in_minutes(sum(method.seconds.values()))} in all, a core each."
+    return prose(
         "methods",
-        facts=_facts(facts),
-        wall=_duration(method.wall),
+        facts=told_facts(facts),
+        wall=in_minutes(method.wall),
         together=together if runs else "",
-        runs=_folded("Wall time of every run", _table("seconds", runs, heads=1)),
+        runs=folded("Wall time of every run", make_table("seconds", runs, heads=1)),
         command=escape(_command(method.settings)),
     )
 
@@ -528,48 +395,11 @@ def _methods(method: Method) -> str:
 def _command(settings: dict[str, Any]) -> str:
     """The command line that makes the same numbers."""
     options = {"--only": "questions", "--body": "bodies", "--seeds": "seeds", "--evaluations": "evaluations"}
-    words = [f"{option} {_words(settings[name], ' ')}" for option, name in options.items() if name in settings]
+    words = [f"{option} {in_words(settings[name], ' ')}" for option, name in options.items() if name in settings]
     return " ".join(["turgor reproduce", *words])
 
 
 def _files(folder: Path) -> str:
     paths = [path for path in (folder / "tables" / f"{name}.csv" for name in KINDS) if path.is_file()]
     items = "".join(f'<li><a href="tables/{path.name}">{path.name}</a></li>\n' for path in paths)
-    return _prose("files", items=items) if items else ""
-
-
-# --- words and numbers --------------------------------------------------------------------------------------------
-
-
-def _number(value: float, form: str) -> str:
-    if form == "p":
-        return "< 0.0001" if value < 0.0001 else f"{value:.4f}"
-    text = format(value, f"z{form}" if isinstance(value, float) else form)
-    return text.replace("-", "−")
-
-
-def _facts(facts: dict[str, Any]) -> str:
-    items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(_words(fact))}</dd>\n" for name, fact in facts.items())
-    return f"<dl>\n{items}</dl>\n" if items else ""
-
-
-def _words(fact: Any, between: str = ", ") -> str:
-    return between.join(map(str, fact)) if isinstance(fact, list | tuple) else str(fact)
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds / 60:,.1f} min" if seconds >= 60 else f"{seconds:.1f} s"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
-
-
-def _each(values: dict[str, float]) -> str:
-    """As in "0.94 (small) and 0.91 (large)"."""
-    return _listed(f"{_number(value, '.2f')} ({escape(body)})" for body, value in values.items())
-
-
-def _listed(words: Iterable[str]) -> str:
-    *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last
+    return prose("files", items=items) if items else ""
