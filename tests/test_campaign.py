@@ -282,6 +282,38 @@ def test_interrupted_and_continued_gives_the_same_bytes(in_one_go, tmp_path):
     assert tables_of(other) == tables_of(folder)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="counts processes in /proc")
+def test_when_the_first_process_is_killed_the_others_keep_their_runs_and_end(tmp_path):
+    folder = tmp_path / "campaign"
+    arguments = ("--only", "rq1", "--body", "small", "--seeds", "2", "--threads", "2", "--out", str(folder))
+    command = [sys.executable, "-m", "turgor", "reproduce", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    wait_for_rows(folder, process)
+    others = [pid for pid in group_of(process.pid) if pid != process.pid]
+    assert len(others) >= 2
+    process.kill()
+    process.wait()
+    until = time.monotonic() + 60
+    while group_of(process.pid) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not group_of(process.pid)
+    states = {Run.open(path.parent).status for path in folder.glob("*/run.json")}
+    assert states == {"interrupted"}
+
+
+def group_of(leader: int) -> list[int]:
+    """Processes of the group of `leader` that are alive."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, group = stat.read_text().rpartition(")")[2].split()[:3]
+        except OSError:  # gone meanwhile
+            continue
+        if int(group) == leader and state != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
 def wait_for_rows(folder: Path, process):
     """Until some run has a generation behind it."""
     until = time.monotonic() + 120

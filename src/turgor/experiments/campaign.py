@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
 import queue
 import signal
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -141,21 +143,37 @@ def open_run(folder: Path, entry: Entry) -> Run | None:
 
 _reports: Any = None
 _stop: Any = None
+_in_hand = threading.Lock()  # held while something must not be torn apart
 
 
 def _begin(reports: Any, stop: Any) -> None:
     global _reports, _stop
     _reports, _stop = reports, stop
-    ignore_interrupts()
+    follow_first_process()
 
 
-def ignore_interrupts() -> None:
-    """Ctrl-C reaches every process of a terminal: the first one decides."""
+def follow_first_process() -> None:
+    """Leaves it to the first process what Ctrl-C means, which reaches every process of a terminal; and ends this one,
+    once what it has in hand is put down, if the first one is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    first = multiprocessing.parent_process()
+    assert first is not None
+
+    def end() -> None:
+        first.join()
+        with _in_hand:
+            os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 def _work(folder: Path, entry: Entry) -> Measured:
     """Runs an entry to its end, wherever it was left, and measures its champion."""
+    with _in_hand:
+        return measure(entry, _evolve(folder, entry))
+
+
+def _evolve(folder: Path, entry: Entry) -> Run | None:
     run = open_run(folder, entry)
     report = _Reporter(entry)
     if entry.evaluations and (run is None or run.status != "done"):
@@ -169,7 +187,7 @@ def _work(folder: Path, entry: Entry) -> Measured:
             run = evolve(entry.make_task(), entry.evaluations, entry.seed, path, recipe=entry.recipe, **how)
         else:
             run = resume(run, **how)
-    return measure(entry, run)
+    return run
 
 
 class _Reporter:

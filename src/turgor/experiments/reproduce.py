@@ -22,7 +22,7 @@ import msgspec
 
 from turgor.errors import InvalidInput, describe
 from turgor.experiments.analysis import by_cell, compare, find_curves, find_effects
-from turgor.experiments.campaign import Progress, ignore_interrupts, run_entries
+from turgor.experiments.campaign import Progress, follow_first_process, run_entries
 from turgor.experiments.claims import check_claims
 from turgor.experiments.figures import draw_figures
 from turgor.experiments.inflation import author_protocol, quasi_static
@@ -148,7 +148,7 @@ def _chosen(measured: Sequence[Measured]) -> list[Measured]:
 def _drawers(processes: int | None) -> Generator[ProcessPoolExecutor]:
     """Processes for what takes long to draw; whatever ends the block ends them."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes or available_cores(), context, ignore_interrupts) as pool:
+    with ProcessPoolExecutor(processes or available_cores(), context, follow_first_process) as pool:
         try:
             yield pool
         except BaseException:
