@@ -9,7 +9,7 @@ from turgor.experiments.analysis import compare, find_effects
 from turgor.experiments.claims import check_claims
 from turgor.experiments.inflation import author_protocol
 from turgor.experiments.plan import make_plan
-from turgor.experiments.rows import read_tables
+from turgor.experiments.rows import Champion, Claim, Comparison, read_rows, read_tables
 from turgor.experiments.sheets import FORMATS
 
 PAPER = Path(__file__).parents[1] / "results" / "paper"
@@ -51,7 +51,25 @@ def test_figures_are_there(name):
         assert (PAPER / "figures" / f"{name}.{suffix}").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/replication.md", "results/paper/README.md"])
+def test_twenty_seeds_begin_with_the_five_and_follow_from_their_champions(tables):
+    folder = PAPER.parent / "twenty-seeds" / "tables"
+    champions = read_rows(folder / "champions.csv", Champion)
+    assert [c.run for c in champions] == [entry.name for entry in make_plan(["rq1", "rq2"], seeds=20)]
+    five = [c for c in tables.champions if not c.change]
+    assert [c for c in champions if c.seed < 5] == five
+    found, published = compare(champions), read_rows(folder / "comparisons.csv", Comparison)
+    assert [(c.body, c.measure, c.a, c.b, c.u) for c in found] == [
+        (c.body, c.measure, c.a, c.b, c.u) for c in published
+    ]
+    assert [c.p_holm for c in found] == pytest.approx([c.p_holm for c in published])
+    claims = read_rows(folder / "claims.csv", Claim)
+    assert check_claims(tables.inflation, champions, published) == claims
+
+
+PAGES = ["README.md", "docs/replication.md", "results/paper/README.md", "results/twenty-seeds/README.md"]
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_what_a_page_links_to_exists(page):
     here = PAPER.parents[1] / page
     links = re.findall(r"\]\(([^)#:]+)\)", here.read_text(encoding="utf-8"))
