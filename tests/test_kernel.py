@@ -19,11 +19,11 @@ from turgor.body import Body, ring
 from turgor.control import rows
 from turgor.physics import reference
 from turgor.physics.actuate import tanh
+from turgor.physics.batch import Batch, World
 from turgor.physics.memory import Floats, Width, aligned, field_of, layout, views
 from turgor.physics.model import COMMANDS, CONTROLLER, WIDTH, Model, State
-from turgor.physics.tables import make_kernel
 from turgor.scene import GROUND_DEPTH, Scene
-from turgor.simulate import Simulator, _Batch, replay
+from turgor.simulate import Simulator, replay
 from turgor.task import Physics, Task, make_task
 
 BODIES = ("small", "medium", "large")
@@ -40,14 +40,14 @@ class Engine:
     def __init__(self, task: Task, theta: np.ndarray, position: np.ndarray | None = None) -> None:
         self.task, self.theta, self.steps = task, theta, 0
         starts = np.repeat(task.position[None], len(theta), axis=0) if position is None else position
-        self.kernel = make_kernel(msgspec.structs.replace(task, end=None))
-        self.batch = _Batch(self.kernel, starts.astype(np.float32))
+        self.batch = Batch(World(msgspec.structs.replace(task, end=None)), starts)
+        self.kernel = self.batch.kernel
         self.batch.think(*rows(theta, task.body, task.condition))
-        self.batch.run(CONTROLLER, first=0, steps=0, last=NEVER)
+        self.batch.begin()
         self._seen: dict[Any, np.ndarray] = {}
 
     def run(self, steps: int) -> None:
-        self.batch.run(CONTROLLER, first=self.steps, steps=steps, last=NEVER)
+        self.batch.run(CONTROLLER, steps, NEVER)
         self.steps += steps
 
     def _field(self, buffer: np.ndarray, view: type, name: str, block: int = 0) -> np.ndarray:
@@ -113,7 +113,7 @@ def controllers(task: Task, agents: int, seed: int, scale: float = 1.0) -> np.nd
 
 @pytest.mark.parametrize("body", BODIES)
 def test_the_engines_pairs_are_in_the_references_order(body: str) -> None:
-    kernel = make_kernel(make_task("flat", body=body))
+    kernel = World(make_task("flat", body=body)).kernel
     a, b = (kernel.field(kernel.tables, Model, name) for name in ("pair_a", "pair_b"))
     pairs = list(zip(a.tolist(), b.tolist(), strict=True))
     assert pairs == sorted(pairs, key=lambda p: (p[1] - p[0], p[0]))
@@ -247,7 +247,7 @@ def compared(case: str) -> list[Compared]:
     for t in times:
         engine.run(t - engine.steps)
         before = [engine.copied(agent) for agent in range(AGENTS)]
-        seen = engine.batch.stand()["observation"]
+        seen = engine.batch.look()[0]
         engine.run(1)
         for agent, state in enumerate(before):
             origin, mine = moved(state, rng), engine.copied(agent)
@@ -363,10 +363,9 @@ def one_step(body: Body, scene: Scene, position: np.ndarray, seed: int) -> list[
         physics=Physics(gravity=0.0, **BLUNT),
     )
     engine = Engine(task, np.zeros((len(position), 0)), position)
-    lanes = engine.batch.lanes
     velocity = np.random.default_rng(seed).uniform(-3, 3, position.shape).astype(np.float32)
-    engine.batch.velocity[:] = velocity[lanes]
-    engine.batch.run(COMMANDS, first=0, steps=1, last=NEVER)
+    engine.batch.velocity[:] = velocity
+    engine.batch.run(COMMANDS, 1, NEVER, fresh=np.ones(len(position), dtype=bool))
     out = []
     for agent, start in enumerate(position.astype(np.float32)):
         plain = reference.start(task, start, velocity[agent])
@@ -439,7 +438,7 @@ def test_impulses_follow_a_mass_from_column_to_column() -> None:
     task = Task(name="slide", body=body, scene=scene, position=[[-2, height]], condition="passive")
     engine = Engine(task, np.zeros((1, 0)))
     engine.batch.velocity[:] = np.float32([8, 0])
-    engine.batch.run(CONTROLLER, first=0, steps=0, last=NEVER)
+    engine.batch.begin()
     plain = reference.start(task, velocity=np.array([[8.0, 0]]))
     met = set()
     for _ in range(60):

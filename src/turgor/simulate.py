@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import sys
-import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from turgor import physics
 from turgor.body import Body
 from turgor.control import check_theta, observation_count, output_count, rows
 from turgor.errors import InvalidInput, describe
-from turgor.physics.memory import LINE, Width, aligned
-from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH, Brain, Result, State, Work
-from turgor.physics.step import run_blocks
-from turgor.physics.tables import Kernel, make_kernel
+from turgor.physics.batch import Batch, World, load_kernel
+from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH
 from turgor.recording import Recording
 from turgor.scene import LARGEST_COORDINATE, Scene
 from turgor.task import Physics, Task, given_rows, start_position
@@ -47,10 +40,17 @@ class Step(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Where a batch of agents stands between two steps; every field is per agent."""
 
     observation: Any  # [1], shape [agent, input]: the window's mean, what a controller sees now
+    stand: Any  # [agent, stand]: all the rest in one array, of which the other fields are views
     position: Any  # [m], shape [agent, mass, 2]
     velocity: Any  # [m/s], shape [agent, mass, 2]
+    touch: Any  # 0 or 1, shape [agent, mass]: whether it touched something in the last step
     pressure: Any  # [Pa], shape [agent, chamber]
-    solved: Any  # [agent], bool: the end has come
+    area: Any  # [m^2], shape [agent, chamber], signed
+
+    @property
+    def solved(self) -> np.ndarray:
+        """Whether the end has come, bool [agent]."""
+        return self.stand[:, -1] > 0
 
 
 class Simulator:
@@ -62,8 +62,8 @@ class Simulator:
             raise InvalidInput("threads: expected a whole number, at least 1", describe(threads))
         self.task = task
         self.threads = threads or available_cores()
-        self._kernel = make_kernel(task)
-        self._stepping: list[_Batch] = []
+        self._world = World(task)
+        self._stepping: list[tuple[Batch, slice]] = []  # the agents that `step` drives, in parts
 
     def rollout(self, theta: ArrayLike, position: ArrayLike | None = None) -> Rollout:
         """A `Rollout` of every row of `theta` [agent, parameter] from the task's start, or from `position` [m],
@@ -75,7 +75,7 @@ class Simulator:
         solved = np.empty(len(theta), dtype=bool)
 
         def run(part: slice) -> None:
-            batch = _Batch(self._kernel, starts[part])
+            batch = Batch(self._world, starts[part])
             batch.think(*rows(theta[part], self.task.body, self.task.condition))
             final[part], steps[part], solved[part] = self._run_whole(batch)
 
@@ -87,80 +87,134 @@ class Simulator:
         [mass, 2]: the same steps that `rollout` takes."""
         theta = check_theta(np.reshape(np.asarray(theta), (1, -1)), self.task.body, self.task.condition)
         starts = self._starts(1, None if position is None else np.asarray(position)[None])
-        batch = _Batch(self._kernel, starts)
+        batch = Batch(self._world, starts)
         batch.think(*rows(theta, self.task.body, self.task.condition))
         trace = batch.trace(self.task.steps)
         final, steps, solved = self._run_whole(batch, trace)
         out = self._judge(starts, final, steps, solved)
         return _recording(self.task, trace[: steps[0] + 1], float(out.fitness[0]), bool(solved[0]))
 
-    def reset(self, agents: int, position: ArrayLike | None = None) -> Step:
-        """Puts `agents` agents at the start, to be driven by `step`; returns their first `Step`."""
+    def reset(self, agents: int, position: ArrayLike | None = None, *, scenes: Sequence[Scene] | None = None) -> Step:
+        """The first `Step` of `agents` agents, put at the start, to be driven by `step`. `position` [m], shape
+        [agent, mass, 2], in place of the task's; `scenes` [agent]: one for each in place of the task's."""
         if not isinstance(agents, int) or agents < 1:
             raise InvalidInput("agents: expected a whole number, at least 1", describe(agents))
         starts = self._starts(agents, position)
+        if scenes is not None and len(scenes) != agents:
+            raise InvalidInput(f"scenes: expected one for each of {agents} agents", str(len(scenes)))
         load_kernel()
-        self._stepping = [_Batch(self._kernel, starts[part]) for part in _parts(agents, self.threads)]
-        for batch in self._stepping:
-            batch.run(COMMANDS, first=0, steps=0, last=self.task.steps - 1)
-        return self._stand()
+        own = None if scenes is None else [self._world.cut(scene) for scene in scenes]
+        # a part for each thread, and no more: this memory stays
+        parts = _cut(agents, min(self.threads, -(-agents // WIDTH)))
+        self._stepping = [(Batch(self._world, starts[mine], own and own[mine]), mine) for mine in parts]
+        out = self._room_for_step("reset", None)
+        for batch, mine in self._stepping:
+            batch.begin(COMMANDS, observations=out.observation[mine], stands=out.stand[mine])
+        return out
 
-    def step(self, commands: ArrayLike) -> Step:
-        """One step of all agents after `reset`, with `commands` [agent, output] in place of a controller's outputs:
-        springs in [-1, 1], then each chamber's pressure change in units of `Task.pressure_step`."""
-        if not self._stepping:
-            raise InvalidInput("step: expected agents at the start; call reset first")
-        agents = sum(batch.agents for batch in self._stepping)
-        commands = np.asarray(commands, dtype=np.float32)
-        outputs = output_count(self.task.body, self.task.condition)
-        if commands.shape != (agents, outputs) or not np.isfinite(commands).all():
-            raise InvalidInput(
-                f"commands: expected finite numbers of shape [{agents}, {outputs}]", f"shape {list(commands.shape)}"
+    def step(self, commands: ArrayLike, out: Step | None = None) -> Step:
+        """The `Step` after one step of all agents, with `commands` [agent, output] in place of a controller's outputs:
+        springs in [-1, 1], then each chamber's pressure change in units of `Task.pressure_step`. `out`: an earlier
+        `Step` of theirs, to be written over in place of a new one."""
+        out = self._room_for_step("step", out)
+        shape = (len(out.stand), output_count(self.task.body, self.task.condition))
+        commands = np.ascontiguousarray(commands, dtype=np.float32)
+        if commands.shape != shape:
+            raise InvalidInput(f"commands: expected shape {list(shape)}", f"shape {list(commands.shape)}")
+        if not np.isfinite(commands).all():
+            raise InvalidInput(f"commands: expected finite numbers of shape {list(shape)}", "NaN or infinity")
+
+        def run(part: tuple[Batch, slice]) -> None:
+            batch, mine = part
+            batch.run(
+                COMMANDS, 1, -1, commands=commands[mine], observations=out.observation[mine], stands=out.stand[mine]
             )
-        parts = _parts(agents, self.threads)
 
-        def run(k: int) -> None:
-            self._stepping[k].command(commands[parts[k]])
+        self._spread(run, self._stepping)
+        return out
 
-        self._spread(run, list(range(len(parts))))
-        return self._stand()
+    def restart(
+        self,
+        which: ArrayLike,
+        position: ArrayLike | None = None,
+        *,
+        scenes: Sequence[Scene] | None = None,
+        out: Step | None = None,
+    ) -> Step:
+        """The `Step` in which the agents `which` [agent, bool] stand at the start again, and the others where they
+        stood. `position` [m], shape [restarted, mass, 2], and `scenes` [restarted] are for the former alone; `scenes`
+        are for agents that had their own from `reset` on."""
+        out = self._room_for_step("restart", out)
+        which = np.asarray(which)
+        if which.shape != (len(out.stand),) or which.dtype != bool:
+            raise InvalidInput(f"which: expected bools of shape [{len(out.stand)}]", describe(which))
+        fresh = np.flatnonzero(which)
+        starts = self._starts(len(fresh), position)
+        if scenes is not None and (len(scenes) != len(fresh) or not self._stepping[0][0].own_scenes):
+            expected = f"scenes: expected one for each of {len(fresh)} agents, after a reset with scenes"
+            raise InvalidInput(expected, str(len(scenes)))
+        cut = [] if scenes is None else [self._world.cut(scene) for scene in scenes]
+        for batch, mine in self._stepping:
+            a, b = np.searchsorted(fresh, [mine.start, mine.stop])
+            agents = fresh[a:b] - mine.start
+            batch.position[agents] = starts[a:b]
+            batch.restart(
+                which[mine],
+                dict(zip(agents.tolist(), cut[a:b], strict=False)),
+                observations=out.observation[mine],
+                stands=out.stand[mine],
+            )
+        return out
 
-    def _stand(self) -> Step:
-        pieces = [batch.stand() for batch in self._stepping]
-        joined = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
-        return Step(**joined)
+    def _room_for_step(self, verb: str, out: Step | None) -> Step:
+        """A `Step` with room for all agents: views into two arrays."""
+        if not self._stepping:
+            raise InvalidInput(f"{verb}: expected agents at the start; call reset first")
+        agents, kernel = self._stepping[-1][1].stop, self._world.kernel
+        if out is None:
+            observation, stand = kernel.rows_for(agents)
+            fields = {name: stand[:, c].reshape(agents, *shape) for name, (c, shape) in kernel.stand.items()}
+            del fields["solved"]
+            return Step(observation=observation, stand=stand, **fields)
+        if out.observation.shape != (agents, kernel.lengths["input"]):
+            raise InvalidInput(f"out: expected a Step of these {agents} agents", f"{len(out.observation)} agents")
+        return out
 
-    def _run_whole(self, batch: _Batch, trace: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _run_whole(self, batch: Batch, trace: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Final positions, steps and solved of a batch that runs the whole task."""
         task = self.task
         drive, script = CONTROLLER, None
         if task.pressure is not None:
             lengths = np.repeat(task.body.rest_length[None], task.steps, axis=0)
             drive, script = REPLAY, np.concatenate([lengths, task.pressure], axis=1)
-        if not callable(task.end):
-            batch.run(drive, first=0, steps=task.steps, last=task.steps - 1, script=script, trace=trace)
-            return batch.result()
-        return self._run_until(batch, drive, script, trace)
+        if callable(task.end):
+            return self._run_until(batch, drive, script, trace)
+        fresh = np.ones(batch.agents, dtype=bool)
+        batch.run(drive, task.steps, task.steps - 1, fresh=fresh, script=script, trace=trace)
+        return batch.result()
 
     def _run_until(
-        self, batch: _Batch, drive: int, script: np.ndarray | None, trace: np.ndarray | None
+        self, batch: Batch, drive: int, script: np.ndarray | None, trace: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The same with an end of the user's own, asked after every step."""
         task = self.task
         final = np.zeros((batch.agents, task.body.mass_count, 2), dtype=np.float32)
         steps = np.zeros(batch.agents, dtype=np.int64)
         solved = np.zeros(batch.agents, dtype=bool)
+        batch.begin(drive, trace=None if trace is None else trace[:1])
+        observations, stands = batch.kernel.rows_for(batch.agents)
+        position = stands[:, : 2 * task.body.mass_count].reshape(final.shape)
         for t in range(task.steps):
-            rows_of_t = None if script is None else script[t : t + 1]
-            # a trace of two rows: before and after this step
-            here = None if trace is None else batch.trace(1)
-            batch.run(drive, first=t, steps=1, last=task.steps - 1, script=rows_of_t, trace=here)
-            if trace is not None and here is not None:
-                trace[t + 1] = here[1]
-                if t == 0:
-                    trace[0] = here[0]
-            position = batch.stand()["position"]
-            done = np.asarray(task.end(position), dtype=bool)  # ty: ignore[not-callable]
+            batch.run(
+                drive,
+                1,
+                task.steps - 1,
+                script=None if script is None else script[t : t + 1],
+                trace=None if trace is None else trace[t + 1 : t + 2],
+                observations=observations,
+                stands=stands,
+            )
+            done = np.asarray(task.end(position.copy()), dtype=bool)  # ty: ignore[not-callable]
             if done.shape != (batch.agents,):
                 raise InvalidInput(f"end: expected bools of shape [{batch.agents}]", f"shape {list(done.shape)}")
             ended = (steps == 0) & (done | (t == task.steps - 1))
@@ -242,100 +296,15 @@ def replay(
         steps=steps,
         pressure=pressure,
     )
-    batch = _Batch(make_kernel(task), task.position[None].astype(np.float32))
+    batch = Batch(World(task), task.position[None].astype(np.float32))
     if velocity is not None:
         batch.velocity[:] = start_position(velocity, body).astype(np.float32)
     trace = batch.trace(steps)
     acting = np.zeros((steps, body.chamber_count)) if task.pressure is None else task.pressure
     load_kernel()
-    batch.run(REPLAY, 0, steps, steps - 1, script=np.concatenate([lengths, acting], axis=1), trace=trace)
+    script = np.concatenate([lengths, acting], axis=1)
+    batch.run(REPLAY, steps, steps - 1, fresh=np.ones(1, dtype=bool), script=script, trace=trace)
     return _recording(task, trace)
-
-
-class _Batch:
-    """Blocks of agents and their memory: what one call of the kernel works on."""
-
-    def __init__(self, kernel: Kernel, starts: np.ndarray) -> None:
-        self.kernel = kernel
-        self.agents = len(starts)
-        blocks = -(-self.agents // WIDTH)
-        # unused lanes repeat the last agent
-        self.lanes = np.minimum(np.arange(blocks * WIDTH), self.agents - 1)
-        self.position = np.ascontiguousarray(starts[self.lanes], dtype=np.float32)
-        self.velocity = np.zeros_like(self.position)
-        self.memory = aligned(blocks, kernel.size(State))
-        self.brains = aligned(blocks, kernel.size(Brain))
-        self.results = aligned(blocks, kernel.size(Result))
-        self._step = 0
-
-    def think(self, weights: np.ndarray, biases: np.ndarray) -> None:
-        """Gives the agents their controllers: weights [agent, output, input], biases [agent, output]."""
-        for block, brain in enumerate(self.brains):
-            lanes = self.lanes[block * WIDTH : (block + 1) * WIDTH]
-            self.kernel.field(brain, Brain, "weight")[:] = weights[lanes].reshape(WIDTH, -1).T
-            self.kernel.field(brain, Brain, "bias")[:] = biases[lanes].T
-
-    def trace(self, steps: int) -> np.ndarray:
-        """Room for a recording of the first block, float32 [step + 1, row, lane]."""
-        body = self.kernel.lengths
-        row = 5 * body["mass"] + body["spring"] + body["chamber"] + body["input"]
-        return aligned(steps + 1, row * WIDTH).reshape(steps + 1, row, WIDTH)
-
-    def run(
-        self,
-        drive: int,
-        first: int,
-        steps: int,
-        last: int,
-        script: np.ndarray | None = None,
-        trace: np.ndarray | None = None,
-        scripts: np.ndarray | None = None,
-    ) -> None:
-        """Runs `steps` steps from step `first`; `last` is the task's last. `script` [step, row] is for all agents,
-        `scripts` [block, size] for each."""
-        if scripts is None:
-            scripts = aligned(1, 0 if script is None else script.size * WIDTH)
-            if script is not None:
-                scripts[0] = np.repeat(script.ravel(), WIDTH)
-        traces = np.zeros((1, 0), np.float32) if trace is None else trace.reshape(1, -1)
-        kernel = self.kernel
-        # the kernel's loads and stores are of whole cache lines
-        assert all(
-            a.ctypes.data % LINE == 0 or a.size == 0 for a in (self.memory, self.brains, self.results, scripts, traces)
-        )
-        run_blocks(
-            _width(), kernel.settings, kernel.tables, self.memory, self.brains, scripts, traces, self.results,
-            kernel.layouts, self.position, self.velocity, drive, first, steps, last,
-        )  # fmt: skip
-
-    def command(self, commands: np.ndarray) -> None:
-        """One step of every agent with `commands` [agent, output] of its own."""
-        blocks = commands[self.lanes].reshape(-1, WIDTH, commands.shape[1])
-        scripts = aligned(len(blocks), commands.shape[1] * WIDTH)
-        scripts[:] = blocks.transpose(0, 2, 1).reshape(len(blocks), -1)
-        self.run(COMMANDS, first=self._step, steps=1, last=-1, scripts=scripts)
-        self._step += 1
-
-    def stand(self) -> dict[str, np.ndarray]:
-        """The fields of a `Step`."""
-        return {
-            "observation": self._rows(self.memory, Work, "mean"),
-            "position": np.stack([self._rows(self.memory, State, name) for name in ("x", "y")], axis=2),
-            "velocity": np.stack([self._rows(self.memory, State, name) for name in ("vx", "vy")], axis=2),
-            "pressure": self._rows(self.memory, State, "pressure"),
-            "solved": self._rows(self.results, Result, "solved")[:, 0] > 0,
-        }
-
-    def result(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Final positions [agent, mass, 2], steps [agent], solved [agent]."""
-        final = np.stack([self._rows(self.results, Result, name) for name in ("x", "y")], axis=2)
-        steps = self._rows(self.results, Result, "steps")[:, 0].astype(np.int64)
-        return final, steps, self._rows(self.results, Result, "solved")[:, 0] > 0
-
-    def _rows(self, buffers: np.ndarray, view: type, name: str) -> np.ndarray:
-        """A field as [agent, length]."""
-        blocks = [self.kernel.field(buffer, view, name).T for buffer in buffers]
-        return np.concatenate(blocks)[: self.agents]
 
 
 def _recording(task: Task, trace: np.ndarray, fitness: float | None = None, solved: bool = False) -> Recording:
@@ -384,8 +353,12 @@ def available_cores() -> int:
 def _parts(agents: int, threads: int) -> list[slice]:
     """The batch cut evenly: for every thread a part, as long as that fills lanes, and none too large."""
     blocks = -(-agents // WIDTH)
-    count = max(min(threads, blocks), -(-blocks // BLOCKS_AT_ONCE))
-    bounds = [agents * k // count for k in range(count + 1)] if count else []
+    return _cut(agents, max(min(threads, blocks), -(-blocks // BLOCKS_AT_ONCE)))
+
+
+def _cut(agents: int, parts: int) -> list[slice]:
+    """Agents cut into equal parts."""
+    bounds = [agents * k // parts for k in range(parts + 1)] if parts else []
     return [slice(a, b) for a, b in pairwise(bounds)]
 
 
@@ -396,25 +369,3 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
     os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-@lru_cache
-def _width() -> Width:
-    """The kernel's width, marked with its sources."""
-    sources = sorted(Path(physics.__file__).parent.glob("*.py"))
-    return Width(WIDTH, hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:12])
-
-
-@lru_cache
-def load_kernel() -> None:
-    """Has the kernel ready, compiled or from the cache; says so if that takes a while."""
-    said = "turgor: compiling the engine for this processor, once ..."
-    notice = threading.Timer(1.5, print, [said], {"file": sys.stderr, "flush": True})
-    notice.daemon = True
-    notice.start()
-    body = Body([[0.0, 0.0]])
-    task = Task(name="nothing", body=body, scene=Scene([]), position=body.position, condition="passive")
-    try:
-        _Batch(make_kernel(task), np.zeros((0, 1, 2))).run(CONTROLLER, first=0, steps=0, last=0)
-    finally:
-        notice.cancel()

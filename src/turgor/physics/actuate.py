@@ -74,13 +74,21 @@ def actuate(settings, model, state, work):
 
 
 @stage
-def take_commands(settings, work, script, row):
-    """Commands from outside instead of the controller's; springs within [-1, 1]."""
-    for j in range(settings.outputs):
-        command = script.row[row * settings.outputs + j]
-        if j < settings.springs:
-            command = clamp(command, -1.0, 1.0)
-        work.command[j] = command
+def take_commands(settings, work, commands, first):
+    """Commands [agent, output] from outside instead of the controller's, of agents `first` ...; springs within
+    [-1, 1]."""
+    for lane in range(settings.lanes):
+        agent = agent_of(first, lane, len(commands))
+        for j in range(settings.outputs):
+            work.command[j, lane] = commands[agent, j]
+    for j in range(min(settings.springs, settings.outputs)):
+        work.command[j] = clamp(work.command[j], -1.0, 1.0)
+
+
+@inlined
+def agent_of(first, lane, agents):
+    """The agent in a lane; the last one also in the lanes that are left over."""
+    return min(first + lane, agents - 1)
 
 
 @stage

@@ -26,7 +26,7 @@ FAR_BELOW = -1e9  # [m], where the segment of an empty slot lies
 
 
 @stage
-def find_ground_contacts(settings, model, state, work):
+def find_ground_contacts(settings, model, ground, state, work):
     """Lists the contacts with the scene and returns their number; renews `touch`."""
     count = np.int64(0)  # not a literal, for which Numba would compile what takes it twice
     for i in range(settings.masses):
@@ -34,7 +34,7 @@ def find_ground_contacts(settings, model, state, work):
         x = state.x[i]
         moved = (x < state.left[i]) | (x >= state.right[i])
         if any_lane(moved):
-            enter_columns(settings, model, state, work, i, lane_bits(moved))
+            enter_columns(settings, model, ground, state, work, i, lane_bits(moved))
         y = state.y[i]
         first = i * settings.slots
         if any_lane((y < state.floor[i]) | (y > state.ceiling[i])):
@@ -136,7 +136,7 @@ def recall(new, old0, impulse0, old1, impulse1):
 
 
 @rare
-def enter_columns(settings, model, state, work, i, lanes):
+def enter_columns(settings, model, ground, state, work, i, lanes):
     """Copies the column that mass i is in to each of `lanes` (bits), and takes along the impulses of the segments
     that the old column had too. A slot whose segment stays is left as it is."""
     reach = model.extent[i] + 1.4143 * settings.reach + MARGIN
@@ -145,18 +145,18 @@ def enter_columns(settings, model, state, work, i, lanes):
     while lanes != 0:
         lane = lowest_bit(lanes)
         lanes = lanes & (lanes - 1)
-        cell = find_column(settings, model, state.x[i, lane], state.cell[i, lane])
+        cell = find_column(settings, ground, lane, state.x[i, lane], state.cell[i, lane])
         state.cell[i, lane] = cell
-        state.left[i, lane] = model.column[cell]
-        state.right[i, lane] = model.column[cell + 1]
-        state.floor[i, lane] = model.floor[cell] + reach
-        state.ceiling[i, lane] = model.ceiling[cell] - reach
-        state.listed[i, lane] = model.listed[cell]
+        state.left[i, lane] = ground.left[cell]
+        state.right[i, lane] = ground.right[cell]
+        state.floor[i, lane] = ground.floor[cell] + reach
+        state.ceiling[i, lane] = ground.ceiling[cell] - reach
+        state.listed[i, lane] = ground.listed[cell]
         carry_impulses(settings, state, work, first, lane)
         for k in range(slots):
-            segment = model.candidate[cell * slots + k]
+            segment = ground.candidate[cell * slots + k]
             if segment != state.segment[first + k, lane]:
-                fill_slot(settings, model, state, work, i, k, lane, segment)
+                fill_slot(settings, model, ground, state, work, i, k, lane, segment)
     used = 0
     for lane in range(settings.lanes):
         used = max(used, state.listed[i, lane])
@@ -166,11 +166,18 @@ def enter_columns(settings, model, state, work, i, lanes):
 
 
 @inlined
-def find_column(settings, model, x, cell):
-    """The column that holds x, looked for from `cell` on: mostly its neighbour."""
-    while cell + 1 < settings.columns and x >= model.column[cell + 1]:
+def first_column(settings, lane):
+    """Where the columns of a lane's scene begin."""
+    return lane * settings.columns if settings.own_ground != 0 else 0
+
+
+@inlined
+def find_column(settings, ground, lane, x, cell):
+    """The column of a lane's scene that holds x, looked for from `cell` on: mostly its neighbour."""
+    first = first_column(settings, lane)
+    while cell + 1 < first + settings.columns and x >= ground.right[cell]:
         cell += 1
-    while cell > 0 and x < model.column[cell]:
+    while cell > first and x < ground.left[cell]:
         cell -= 1
     return cell
 
@@ -193,7 +200,7 @@ def carry_impulses(settings, state, work, first, lane):
 
 
 @inlined
-def fill_slot(settings, model, state, work, i, k, lane, segment):
+def fill_slot(settings, model, ground, state, work, i, k, lane, segment):
     """Puts a segment into slot k of a lane, with the impulses that were set aside for it."""
     slot = i * settings.slots + k
     state.segment[slot, lane] = segment
@@ -205,15 +212,15 @@ def fill_slot(settings, model, state, work, i, k, lane, segment):
         state.depth[slot, lane] = 0.0
         state.extent[slot, lane] = 0.0
     else:
-        state.px[slot, lane] = model.x1[segment]
-        state.py[slot, lane] = model.y1[segment]
-        state.qx[slot, lane] = model.x2[segment]
-        state.qy[slot, lane] = model.y2[segment]
-        state.nx[slot, lane] = model.nx[segment]
-        state.ny[slot, lane] = model.ny[segment]
-        state.depth[slot, lane] = model.depth[segment]
-        along_a = model.nx[segment] * model.cosine[i] + model.ny[segment] * model.sine[i]
-        along_b = model.ny[segment] * model.cosine[i] - model.nx[segment] * model.sine[i]
+        state.px[slot, lane] = ground.x1[segment]
+        state.py[slot, lane] = ground.y1[segment]
+        state.qx[slot, lane] = ground.x2[segment]
+        state.qy[slot, lane] = ground.y2[segment]
+        state.nx[slot, lane] = ground.nx[segment]
+        state.ny[slot, lane] = ground.ny[segment]
+        state.depth[slot, lane] = ground.depth[segment]
+        along_a = ground.nx[segment] * model.cosine[i] + ground.ny[segment] * model.sine[i]
+        along_b = ground.ny[segment] * model.cosine[i] - ground.nx[segment] * model.sine[i]
         against, face = largest_of(along_b, -along_a, -along_b, along_a)
         state.facing[slot, lane] = face
         state.lean[slot, lane] = -against

@@ -37,8 +37,9 @@ class Settings(NamedTuple):
     outputs: np.int32
     chains: np.int32
     pairs: np.int32
-    columns: np.int32
-    slots: np.int32  # most segments that any column of the scene holds
+    columns: np.int32  # room for them in a scene
+    slots: np.int32  # room for segments in a column
+    own_ground: np.int32  # whether each lane has a scene of its own
     window: np.int32
     unit_observation: np.int32  # signed values v are observed as (v + 1) / 2
     pressure_source: np.int32
@@ -94,19 +95,6 @@ class Model(NamedTuple):
     pressure_max: Annotated[FloatTable, "chamber"]  # [Pa]
     pressure_step: Annotated[FloatTable, "chamber"]  # [Pa] per unit of output
     pressure_scale: Annotated[FloatTable, "chamber"]  # 1 / p_max [1/Pa]
-    # scene: segments, and columns ("cells") that list the segments which a mass with its centre there can meet
-    x1: Annotated[FloatTable, "segment"]  # [m]
-    y1: Annotated[FloatTable, "segment"]
-    x2: Annotated[FloatTable, "segment"]
-    y2: Annotated[FloatTable, "segment"]
-    nx: Annotated[FloatTable, "segment"]  # outward normal
-    ny: Annotated[FloatTable, "segment"]
-    depth: Annotated[FloatTable, "segment"]  # [m]
-    column: Annotated[FloatTable, "column_end"]  # [m], left ends, and the right end of the last
-    floor: Annotated[FloatTable, "column"]  # [m]: a square between floor and ceiling touches nothing
-    ceiling: Annotated[FloatTable, "column"]  # [m]
-    listed: Annotated[IntTable, "column"]  # segments in the column
-    candidate: Annotated[IntTable, "candidate"]  # [column, slot], ascending
     # pairs of masses that can collide
     pair_a: Annotated[IntTable, "pair"]
     pair_b: Annotated[IntTable, "pair"]
@@ -115,6 +103,27 @@ class Model(NamedTuple):
     pair_sine: Annotated[FloatTable, "pair"]
     pair_share_a: Annotated[FloatTable, "pair"]  # of the pair's relative velocity that changes at a: m_b / (m_a + m_b)
     pair_share_b: Annotated[FloatTable, "pair"]
+
+
+class Ground(NamedTuple):
+    """Scenes: segments, and columns ("cells") that list the segments which a mass with its centre there can meet.
+
+    One scene for all lanes, or one for each, side by side with room for `segments` and `columns` each.
+    """
+
+    x1: Annotated[FloatTable, "segment"]  # [m]
+    y1: Annotated[FloatTable, "segment"]
+    x2: Annotated[FloatTable, "segment"]
+    y2: Annotated[FloatTable, "segment"]
+    nx: Annotated[FloatTable, "segment"]  # outward normal
+    ny: Annotated[FloatTable, "segment"]
+    depth: Annotated[FloatTable, "segment"]  # [m]
+    left: Annotated[FloatTable, "column"]  # [m], ends
+    right: Annotated[FloatTable, "column"]
+    floor: Annotated[FloatTable, "column"]  # [m]: a square between floor and ceiling touches nothing
+    ceiling: Annotated[FloatTable, "column"]  # [m]
+    listed: Annotated[IntTable, "column"]  # segments in the column
+    candidate: Annotated[IntTable, "candidate"]  # [column, slot], ascending
 
 
 class State(NamedTuple):
@@ -130,6 +139,8 @@ class State(NamedTuple):
     pressure: Annotated[Floats, "chamber"]  # [Pa]
     window: Annotated[Floats, "window"]  # [window, input], the last observations
     total: Annotated[Floats, "input"]  # their sum
+    age: Annotated[Floats, "one"]  # observations since the agent's start
+    phase: Annotated[Floats, "one"]  # the last one's place among `window`, counted from the agent's start
     # the column that each mass is in, copied to the lanes: [mass]
     cell: Annotated[Ints, "mass"]  # its index
     left: Annotated[Floats, "mass"]  # [m]
@@ -185,6 +196,7 @@ class Work(NamedTuple):
     # commands: one per spring in (-1, 1), then one per chamber
     command: Annotated[Floats, "output"]
     mean: Annotated[Floats, "input"]  # of the window
+    area: Annotated[Floats, "chamber"]  # [m^2], signed
     # displacement of this step [m]
     dx: Annotated[Floats, "mass"]
     dy: Annotated[Floats, "mass"]
@@ -223,9 +235,9 @@ class Brain(NamedTuple):
 
 
 class Script(NamedTuple):
-    """Commands from outside: controller outputs (COMMANDS), or rest lengths and pressures (REPLAY)."""
+    """Rest lengths and pressures from outside (REPLAY)."""
 
-    row: Annotated[Floats, "script"]  # [step, output] or [step, spring + chamber]
+    row: Annotated[Floats, "script"]  # [step, spring + chamber]
 
 
 class Trace(NamedTuple):
@@ -243,4 +255,5 @@ class Result(NamedTuple):
     solved: Annotated[Floats, "one"]  # 1 where the end came before the last step
 
 
-VIEWS = (Model, State, Work, Brain, Result, Script)
+VIEWS = (Model, Ground, State, Work, Brain, Result, Script)
+SHARED = (Model, Ground)  # tables without lanes

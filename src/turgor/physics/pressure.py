@@ -2,7 +2,7 @@
 
 import math
 
-from turgor.physics.lanes import stage
+from turgor.physics.lanes import inlined, stage
 from turgor.physics.memory import fill
 from turgor.physics.model import GAS_LAW, NOWHERE
 
@@ -13,15 +13,22 @@ def gas_law(settings, model, state):
     if settings.pressure_source != GAS_LAW:
         return
     for c in range(settings.chambers):
-        first = model.edge_from[model.edge_start[c]]
-        x0 = state.x[first]
-        y0 = state.y[first]
-        area = fill(state.x, 0.0)
-        for e in range(model.edge_start[c], model.edge_start[c + 1]):
-            i = model.edge_from[e]
-            k = model.edge_to[e]
-            area += (state.x[i] - x0) * (state.y[k] - y0) - (state.x[k] - x0) * (state.y[i] - y0)
-        state.pressure[c] = model.gas_energy[c] / max(0.5 * area, fill(state.x, model.area_floor[c]))
+        area = signed_area(model, state, c)
+        state.pressure[c] = model.gas_energy[c] / max(area, fill(state.x, model.area_floor[c]))
+
+
+@inlined
+def signed_area(model, state, c):
+    """A chamber's area [m^2] by the shoelace formula; negative where the loop runs clockwise."""
+    first = model.edge_from[model.edge_start[c]]
+    x0 = state.x[first]
+    y0 = state.y[first]
+    area = fill(state.x, 0.0)
+    for e in range(model.edge_start[c], model.edge_start[c + 1]):
+        i = model.edge_from[e]
+        k = model.edge_to[e]
+        area += (state.x[i] - x0) * (state.y[k] - y0) - (state.x[k] - x0) * (state.y[i] - y0)
+    return 0.5 * area
 
 
 @stage

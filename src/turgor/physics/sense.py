@@ -1,6 +1,6 @@
 """Sensing: the present observation is pushed into the window, whose mean the controller sees."""
 
-from turgor.physics.lanes import inlined, rare, stage
+from turgor.physics.lanes import any_lane, inlined, rare, select, stage
 from turgor.physics.memory import fill
 
 
@@ -10,8 +10,16 @@ def clamp(value, low, high):
 
 
 @stage
+def grow_older(settings, state):
+    """Every agent has one observation more; its window may be younger than that of others in its block."""
+    state.age[0] = state.age[0] + 1.0
+    state.phase[0] = select(state.phase[0] == settings.window - 1, 0.0, state.phase[0] + 1.0)
+
+
+@stage
 def sense(settings, model, state, work, t):
-    """Pushes  o = (touch, relative positions, velocity, pressures)  after t steps into the window; renews the mean."""
+    """Puts  o = (touch, relative positions, velocity, pressures)  after t steps of the block into the window; renews
+    the mean. Doing it twice changes nothing."""
     n = settings.masses
     slot = t % settings.window
     at = slot * settings.inputs
@@ -32,9 +40,10 @@ def sense(settings, model, state, work, t):
     push(state, at, 3 * n + 1, signed(settings, cvy * settings.velocity_scale))
     for c in range(settings.chambers):
         push(state, at, 3 * n + 2 + c, clamp(state.pressure[c] * model.pressure_scale[c], 0.0, 1.0))
-    if slot == settings.window - 1:
-        renew_total(settings, state)
-    share = 1.0 / min(t + 1, settings.window)
+    renew = state.phase[0] == settings.window - 1
+    if any_lane(renew):
+        renew_total(settings, state, slot, renew)
+    share = 1.0 / min(state.age[0], settings.window)
     for k in range(settings.inputs):
         work.mean[k] = state.total[k] * share
 
@@ -54,10 +63,14 @@ def push(state, at, k, value):
 
 
 @rare
-def renew_total(settings, state):
-    """Sums the window anew, once per window, so that the running sums gather no rounding errors."""
+def renew_total(settings, state, slot, renew):
+    """Sums the window anew, from the oldest observation to the one in `slot`, once per window of an agent's own, so
+    that the running sums gather no rounding errors."""
+    oldest = (slot + 1) % settings.window
     for k in range(settings.inputs):
-        total = state.window[k]
-        for w in range(1, settings.window):
+        total = state.window[oldest * settings.inputs + k]
+        for w in range(oldest + 1, settings.window):
             total += state.window[w * settings.inputs + k]
-        state.total[k] = total
+        for w in range(oldest):
+            total += state.window[w * settings.inputs + k]
+        state.total[k] = select(renew, total, state.total[k])

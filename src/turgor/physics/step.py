@@ -2,17 +2,20 @@
 
 from functools import partial
 
+import numpy as np
 from numba import njit
 
-from turgor.physics.actuate import actuate, control, take_commands, take_lengths
-from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, note_travel
+from turgor.physics.actuate import actuate, agent_of, control, take_commands, take_lengths
+from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, first_column, note_travel
 from turgor.physics.lanes import any_lane, rare, select, stage
+from turgor.physics.manifold import NO_ID
 from turgor.physics.memory import lane_count, views
 from turgor.physics.model import (
     COMMANDS,
     CONTROLLER,
     UNKNOWN,
     Brain,
+    Ground,
     Model,
     Result,
     Script,
@@ -20,20 +23,21 @@ from turgor.physics.model import (
     Trace,
     Work,
 )
-from turgor.physics.pressure import apply_forces, gas_law
-from turgor.physics.sense import sense
+from turgor.physics.pressure import apply_forces, gas_law, signed_area
+from turgor.physics.sense import grow_older, sense
 from turgor.physics.solver import correct_positions, integrate, solve_velocities, warm_start_contacts
 from turgor.physics.springs import prepare_springs
 
 
 @stage
-def step(settings, model, state, work, brain, script, drive, t, row):
-    """Step t (from 0) of a block. It starts from an observation and ends with the one that the next step needs."""
+def step(settings, model, ground, state, work, brain, script, commands, drive, first, t, row):
+    """Step t (from 0) of the block of agents `first` ... It starts from an observation and ends with the one that the
+    next step needs."""
     if drive == CONTROLLER:
         control(settings, brain, work)
         actuate(settings, model, state, work)
     elif drive == COMMANDS:
-        take_commands(settings, work, script, row)
+        take_commands(settings, work, commands, first)
         actuate(settings, model, state, work)
     else:
         take_lengths(settings, state, script, row)
@@ -41,7 +45,7 @@ def step(settings, model, state, work, brain, script, drive, t, row):
     gas_law(settings, model, state)
     apply_forces(settings, model, state)
 
-    grounds = find_ground_contacts(settings, model, state, work)
+    grounds = find_ground_contacts(settings, model, ground, state, work)
     pairs = find_pair_contacts(settings, model, state, work)
     warm_start_contacts(model, state, work, grounds, pairs)
     prepare_springs(settings, model, state, work)
@@ -50,46 +54,60 @@ def step(settings, model, state, work, brain, script, drive, t, row):
     correct_positions(settings, model, state, work, grounds, pairs)
     note_travel(settings, state, work, t)
 
+    grow_older(settings, state)
     sense(settings, model, state, work, t + 1)
 
 
 @rare
-def begin(settings, model, state, work, result, position, velocity, first, width, t):
-    """Puts agents `first` ... of `position` [agent, mass, 2] into the lanes, at rest lengths and without a past, and
-    makes their first observation, at t = 0."""
+def begin(settings, model, state, work, result, fresh, position, velocity, first, t):
+    """Puts those of the agents `first` ... that are `fresh` [agent] at `position` [agent, mass, 2], at rest lengths and
+    without a past, and makes their first observation, after t steps of the block. The others stay as they are."""
+    agents = len(fresh)
+    begun = False
+    for lane in range(settings.lanes):
+        agent = agent_of(first, lane, agents)
+        if fresh[agent]:
+            put_at_start(settings, model, state, result, position[agent], velocity[agent], lane)
+            begun = True
+    if begun:
+        state.travel[0] = 0.0  # all pairs are looked at again
+        for p in range(settings.pairs):
+            state.wake[p] = 0.0
+        sense(settings, model, state, work, t)
+
+
+@rare
+def put_at_start(settings, model, state, result, position, velocity, lane):
+    """One agent into one lane."""
     for i in range(settings.masses):
-        for lane in range(lane_count(width)):
-            state.x[i, lane] = position[first + lane, i, 0]
-            state.y[i, lane] = position[first + lane, i, 1]
-            state.vx[i, lane] = velocity[first + lane, i, 0]
-            state.vy[i, lane] = velocity[first + lane, i, 1]
-            state.listed[i, lane] = 0
-            state.cell[i, lane] = 0
-        state.touch[i] = 0.0
+        state.x[i, lane] = position[i, 0]
+        state.y[i, lane] = position[i, 1]
+        state.vx[i, lane] = velocity[i, 0]
+        state.vy[i, lane] = velocity[i, 1]
+        state.touch[i, lane] = 0.0
         # outside any column, so that the first step looks its column up
-        state.left[i] = 1e30
-        state.right[i] = -1e30
-        state.used[i] = 0
+        state.left[i, lane] = np.inf
+        state.right[i, lane] = -np.inf
+        state.cell[i, lane] = first_column(settings, lane)
+        state.listed[i, lane] = 0
     for j in range(settings.springs):
-        state.rest[j] = model.rest[j]
-        state.impulse[j] = 0.0
+        state.rest[j, lane] = model.rest[j]
+        state.impulse[j, lane] = 0.0
     for c in range(settings.chambers):
-        state.pressure[c] = model.pressure_start[c]
+        state.pressure[c, lane] = model.pressure_start[c]
     for k in range(settings.window * settings.inputs):
-        state.window[k] = 0.0
+        state.window[k, lane] = 0.0
     for k in range(settings.inputs):
-        state.total[k] = 0.0
+        state.total[k, lane] = 0.0
+    state.age[0, lane] = 1.0
+    state.phase[0, lane] = 0.0
     for slot in range(settings.masses * settings.slots):
-        state.ground_live[slot] = 0
-        for lane in range(lane_count(width)):
-            state.segment[slot, lane] = UNKNOWN
+        state.segment[slot, lane] = UNKNOWN
     for p in range(settings.pairs):
-        state.pair_live[p] = 0
-        state.wake[p] = 0.0
-    state.travel[0] = 0.0
-    result.steps[0] = 0.0
-    result.solved[0] = 0.0
-    sense(settings, model, state, work, t)
+        state.pair_id0[p, lane] = NO_ID
+        state.pair_id1[p, lane] = NO_ID
+    result.steps[0, lane] = 0.0
+    result.solved[0, lane] = 0.0
 
 
 @stage
@@ -136,37 +154,68 @@ def record(settings, state, work, trace, row):
         trace.row[at + k] = work.mean[k]
 
 
-def _run_blocks(
-    width, settings, tables, memory, brains, scripts, traces, results, layouts, position, velocity,
-    drive, first_step, steps, last_step,
-):  # fmt: skip
-    """Runs every block of `memory` [block, size] for `steps` steps from `first_step`; 0 begins anew.
+@rare
+def hand_out(settings, model, state, work, result, observations, stands, first):
+    """Writes what is seen of the agents `first` ... from outside: rows of `observations` [agent, input] and `stands`
+    [agent, stand] (see `tables.Kernel.stand`)."""
+    n = settings.masses
+    for c in range(settings.chambers):
+        work.area[c] = signed_area(model, state, c)
+    for lane in range(min(settings.lanes, len(observations) - first)):
+        seen = observations[first + lane]
+        stand = stands[first + lane]
+        for k in range(settings.inputs):
+            seen[k] = work.mean[k, lane]
+        for i in range(n):
+            stand[2 * i] = state.x[i, lane]
+            stand[2 * i + 1] = state.y[i, lane]
+            stand[2 * n + 2 * i] = state.vx[i, lane]
+            stand[2 * n + 2 * i + 1] = state.vy[i, lane]
+            stand[4 * n + i] = state.touch[i, lane]
+        for c in range(settings.chambers):
+            stand[5 * n + c] = state.pressure[c, lane]
+            stand[5 * n + settings.chambers + c] = work.area[c, lane]
+        stand[5 * n + 2 * settings.chambers] = result.solved[0, lane]
 
-    The other arrays go with it block by block (scripts and traces: one for all), seen through `layouts` [view, field].
-    `position`, `velocity` [agent, mass, 2] are the start. Writes `results`, and `traces` if there is room for them.
+
+def _run_blocks(
+    width, settings, tables, grounds, memory, brains, scripts, traces, results, layouts, fresh, position, velocity,
+    commands, observations, stands, drive, first_step, steps, last_step,
+):  # fmt: skip
+    """Runs every block of `memory` [block, size] for `steps` steps from `first_step`, after the agents that are `fresh`
+    [agent] have been put at `position`, `velocity` [agent, mass, 2].
+
+    The other buffers go with it block by block (scripts, traces and a ground for all lanes: one for all), seen through
+    `layouts` [view, field]. `commands` [agent, output] are those of the drive COMMANDS. Writes `results`, and `traces`,
+    `observations`, `stands` if there is room for them.
     """
     model = views(Model, tables, layouts[0], width)
     recording = traces.shape[1] > 0
     for block in range(len(memory)):
-        state = views(State, memory[block], layouts[1], width)
-        work = views(Work, memory[block], layouts[2], width)
-        brain = views(Brain, brains[block], layouts[3], width)
-        result = views(Result, results[block], layouts[4], width)
-        script = views(Script, scripts[0], layouts[5], width)
-        trace = views(Trace, traces[0], layouts[5], width)
-        if first_step == 0:
-            begin(
-                settings, model, state, work, result, position, velocity, block * lane_count(width), width, first_step
-            )
+        ground = views(Ground, grounds[block if settings.own_ground != 0 else 0], layouts[1], width)
+        state = views(State, memory[block], layouts[2], width)
+        work = views(Work, memory[block], layouts[3], width)
+        brain = views(Brain, brains[block], layouts[4], width)
+        result = views(Result, results[block], layouts[5], width)
+        script = views(Script, scripts[0], layouts[6], width)
+        trace = views(Trace, traces[0], layouts[6], width)
+        first = block * lane_count(width)
+        row = 0
+        if len(fresh) > 0:
+            begin(settings, model, state, work, result, fresh, position, velocity, first, first_step)
             if recording:
-                record(settings, state, work, trace, first_step)
+                record(settings, state, work, trace, row)
+                row += 1
         for k in range(steps):
             t = first_step + k
-            step(settings, model, state, work, brain, script, drive, t, k)
+            step(settings, model, ground, state, work, brain, script, commands, drive, first, t, k)
             if recording:
-                record(settings, state, work, trace, k + 1)
+                record(settings, state, work, trace, row)
+                row += 1
             if note_end(settings, model, state, result, t, t == last_step):
                 break
+        if len(observations) > 0:
+            hand_out(settings, model, state, work, result, observations, stands, first)
 
 
 # The cache knows `width`, and through it the sources of all that is called here: see memory.Width. Where no folder can

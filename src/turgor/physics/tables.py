@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from turgor.body import Body
 from turgor.control import observation_count, output_count
 from turgor.errors import InvalidInput
+from turgor.physics.ground import Columns, Room
 from turgor.physics.memory import aligned, field_of, fields, layout
 from turgor.physics.model import (
     CONTROLLED,
@@ -18,14 +18,15 @@ from turgor.physics.model import (
     GIVEN,
     MARGIN,
     NOWHERE,
+    SHARED,
     VIEWS,
     WIDTH,
+    Ground,
     Model,
     Settings,
     State,
     Work,
 )
-from turgor.scene import Scene
 from turgor.task import Leave, Task
 
 LARGEST = float(np.finfo(np.float32).max)
@@ -41,7 +42,7 @@ class Kernel(NamedTuple):
 
     def field(self, buffer: np.ndarray, view: type, name: str) -> np.ndarray:
         """A field of a `view` in one block's `buffer`, writable: [length, lane], or [length] for tables."""
-        width = 1 if view is Model else WIDTH
+        width = 1 if view in SHARED else WIDTH
         return field_of(buffer, view, self.layouts[VIEWS.index(view)], name, self.lengths, width)
 
     def size(self, view: type) -> int:
@@ -49,17 +50,39 @@ class Kernel(NamedTuple):
         last = Work if view is State else view
         return int(self.layouts[VIEWS.index(last), len(fields(last))])
 
+    def rows_for(self, agents: int) -> tuple[np.ndarray, np.ndarray]:
+        """Room for what `hand_out` writes: observations [agent, input] and stands [agent, stand], not filled."""
+        width = max(columns.stop for columns, _ in self.stand.values())
+        return np.empty((agents, self.lengths["input"]), np.float32), np.empty((agents, width), np.float32)
 
-def make_kernel(task: Task) -> Kernel:
-    """The `Kernel` of a task."""
+    @property
+    def stand(self) -> dict[str, tuple[slice, tuple[int, ...]]]:
+        """{name: (columns, shape)} of what `hand_out` writes in an agent's row."""
+        masses, chambers = self.lengths["mass"], self.lengths["chamber"]
+        shapes: dict[str, tuple[int, ...]] = {
+            "position": (masses, 2),
+            "velocity": (masses, 2),
+            "touch": (masses,),
+            "pressure": (chambers,),
+            "area": (chambers,),
+            "solved": (),
+        }
+        ends = np.cumsum([math.prod(shape) for shape in shapes.values()]).tolist()
+        return {
+            name: (slice(end - math.prod(shape), end), shape)
+            for (name, shape), end in zip(shapes.items(), ends, strict=True)
+        }
+
+
+def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
+    """The `Kernel` of a task, with `room` for a scene that all agents share, or for one of each agent's own."""
     body, physics = task.body, task.physics
     tables: dict[str, np.ndarray] = {}
     tables |= _mass_tables(body)
     tables |= _spring_tables(body, physics.dt)
     tables |= _chamber_tables(task)
-    tables |= _scene_tables(task.scene, _margin(body, physics.skin))
     tables |= _pair_tables(body, physics.skin)
-    slots = tables.pop("slots").item()
+    scenes = WIDTH if own_ground else 1
     lengths = {
         "mass": body.mass_count,
         "spring": body.spring_count,
@@ -67,12 +90,11 @@ def make_kernel(task: Task) -> Kernel:
         "chamber": body.chamber_count,
         "chamber_end": body.chamber_count + 1,
         "edge": len(tables["edge_from"]),
-        "segment": len(task.scene.segments),
-        "column": len(tables["floor"]),
-        "column_end": len(tables["floor"]) + 1,
-        "candidate": len(tables["candidate"]),
+        "segment": room.segments * scenes,
+        "column": room.columns * scenes,
+        "candidate": room.columns * room.slots * scenes,
         "pair": len(tables["pair_a"]),
-        "slot": body.mass_count * slots,
+        "slot": body.mass_count * room.slots,
         "input": observation_count(body),
         "output": output_count(body, task.condition),
         "one": 1,
@@ -92,8 +114,9 @@ def make_kernel(task: Task) -> Kernel:
         outputs=np.int32(lengths["output"]),
         chains=np.int32(lengths["chain"] - 1),
         pairs=np.int32(lengths["pair"]),
-        columns=np.int32(lengths["column"]),
-        slots=np.int32(slots),
+        columns=np.int32(room.columns),
+        slots=np.int32(room.slots),
+        own_ground=np.int32(own_ground),
         window=np.int32(task.sensing.window),
         unit_observation=np.int32(task.sensing.observation == "unit"),
         pressure_source=np.int32(_pressure_source(task)),
@@ -116,15 +139,40 @@ def make_kernel(task: Task) -> Kernel:
     )
     kernel = Kernel(settings, buffer, layouts, lengths)
     for name, values in tables.items():
-        if (np.isfinite(values) & (np.abs(values) > LARGEST)).any():
-            raise InvalidInput(f"{name}: expected numbers within {LARGEST:.0e}", f"{np.abs(values).max():.3g}")
-        kernel.field(buffer, Model, name)[:] = values
+        kernel.field(buffer, Model, name)[:] = in_float32(name, values)
     return kernel
+
+
+def write_ground(kernel: Kernel, buffer: np.ndarray, scene: Columns, place: int = 0) -> None:
+    """Writes a scene into a block's ground `buffer`; `place` is the lane, where each has one of its own."""
+    scenes = WIDTH if kernel.settings.own_ground else 1
+    columns, slots = kernel.settings.columns.item(), kernel.settings.slots.item()
+    candidate = np.full((columns, slots), NOWHERE)
+    known = candidate[: len(scene.candidate), : scene.candidate.shape[1]]
+    # the lanes' segments stand side by side
+    known[:] = np.where(
+        scene.candidate == NOWHERE, NOWHERE, scene.candidate + place * (kernel.lengths["segment"] // scenes)
+    )
+    for name, values in scene._replace(candidate=candidate.ravel())._asdict().items():
+        table = kernel.field(buffer, Ground, name).reshape(scenes, -1)[place]
+        table[: len(values)] = in_float32(name, values)
+        table[len(values) :] = _BEYOND.get(name, 0)
+
+
+# Columns that a scene leaves over are entered by nothing but a mass that has flown to infinity.
+_BEYOND = {"left": math.inf, "right": math.inf, "floor": -math.inf, "ceiling": math.inf}
+
+
+def in_float32(name: str, values: np.ndarray) -> np.ndarray:
+    """`values`; raises `InvalidInput` where a finite one is none in float32."""
+    if (np.isfinite(values) & (np.abs(values) > LARGEST)).any():
+        raise InvalidInput(f"{name}: expected numbers within {LARGEST:.0e}", f"{np.abs(values).max():.3g}")
+    return values
 
 
 def _layouts(lengths: dict[str, int]) -> np.ndarray:
     """Offsets of every view; Work stands behind State in the same buffer."""
-    rows = [layout(view, lengths, 1 if view is Model else WIDTH) for view in VIEWS]
+    rows = [layout(view, lengths, 1 if view in SHARED else WIDTH) for view in VIEWS]
     rows[VIEWS.index(Work)] += rows[VIEWS.index(State)][-1]
     table = np.zeros((len(rows), max(len(row) for row in rows)), dtype=np.int64)
     for k, row in enumerate(rows):
@@ -136,11 +184,6 @@ def _pressure_source(task: Task) -> int:
     if task.pressure is not None:
         return GIVEN
     return CONTROLLED if task.condition == "pressure" else GAS_LAW
-
-
-def _margin(body: Body, skin: float) -> float:
-    """How far from a mass's centre it can meet a segment [m]."""
-    return math.sqrt(2) * (float(body.side.max()) / 2 + 2 * skin) + MARGIN
 
 
 def _mass_tables(body: Body) -> dict[str, np.ndarray]:
@@ -215,51 +258,6 @@ def _chamber_tables(task: Task) -> dict[str, np.ndarray]:
         "pressure_step": task.pressure_step,
         "pressure_scale": scale,
     }
-
-
-def _scene_tables(scene: Scene, margin: float) -> dict[str, np.ndarray]:
-    """Columns are cut wherever the list of segments within `margin` changes, so that each list is exact."""
-    segments, normal = scene.segments, scene.normal
-    low = np.minimum(segments[:, 0], segments[:, 2]) - margin
-    high = np.maximum(segments[:, 0], segments[:, 2]) + margin
-    cuts = np.unique(np.float32(np.concatenate([low, high])))
-    column = np.concatenate([[-np.inf], cuts, [np.inf]])
-    lists = [np.flatnonzero((low < b) & (high > a)) for a, b in pairwise(column)]
-    slots = max([1, *(len(found) for found in lists)])
-    candidate = np.full((len(lists), slots), NOWHERE)
-    floor, ceiling = np.full(len(lists), -np.inf), np.full(len(lists), np.inf)
-    for k, found in enumerate(lists):
-        candidate[k, : len(found)] = found
-        for s in found:
-            bottom, top = _span(segments[s], column[k] - margin, column[k + 1] + margin)
-            if normal[s, 1] <= 0:
-                ceiling[k] = min(ceiling[k], bottom)
-            if normal[s, 1] >= 0:
-                floor[k] = max(floor[k], top)
-    return {
-        "x1": segments[:, 0],
-        "y1": segments[:, 1],
-        "x2": segments[:, 2],
-        "y2": segments[:, 3],
-        "nx": normal[:, 0],
-        "ny": normal[:, 1],
-        "depth": scene.depth,
-        "column": column,
-        "floor": floor,
-        "ceiling": ceiling,
-        "listed": np.array([len(found) for found in lists]),
-        "candidate": candidate.ravel(),
-        "slots": np.array(slots),
-    }
-
-
-def _span(segment: np.ndarray, left: float, right: float) -> tuple[float, float]:
-    """Lowest and highest y of a segment between two x."""
-    x1, y1, x2, y2 = segment
-    if x1 == x2:
-        return min(y1, y2), max(y1, y2)
-    ends = [y1 + (y2 - y1) * (min(max(x, min(x1, x2)), max(x1, x2)) - x1) / (x2 - x1) for x in (left, right)]
-    return min(ends), max(ends)
 
 
 def _pair_tables(body: Body, skin: float) -> dict[str, np.ndarray]:

@@ -1,0 +1,221 @@
+"""A batch of agents: blocks of lanes, their memory, and the calls of the kernel that move them."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import threading
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from turgor.body import Body
+from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, room_for
+from turgor.physics.memory import LINE, Width, aligned, fields
+from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
+from turgor.physics.step import run_blocks
+from turgor.physics.tables import make_kernel, write_ground
+from turgor.scene import Scene
+from turgor.task import Task
+
+_NO_SCRIPT = aligned(1, 0)
+_NO_TRACE = np.zeros((1, 0), np.float32)
+_NO_ROWS = np.zeros((0, 0), np.float32)
+_NOBODY = np.zeros(0, dtype=bool)
+_SPARE = 0.15  # room for scenes that are a little larger than those seen
+
+
+class World:
+    """A task as the kernel sees it, with its one scene: what the batches of a simulator share."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.columns = self.cut(task.scene)
+        self.kernel = make_kernel(task, room_for([self.columns]))
+        self.grounds = aligned(1, self.kernel.size(Ground))
+        write_ground(self.kernel, self.grounds[0], self.columns)
+
+    def cut(self, scene: Scene) -> Columns:
+        """The columns of a `scene` for the task's body."""
+        return cut_into_columns(scene, reach_of(self.task.body, self.task.physics.skin))
+
+
+class Batch:
+    """Blocks of agents and their memory: what one call of the kernel works on.
+
+    All agents share the world's scene, or each has one of `scenes` [agent] of its own.
+    """
+
+    def __init__(self, world: World, position: np.ndarray, scenes: Sequence[Columns] | None = None) -> None:
+        """`position` [m], shape [agent, mass, 2]: where the agents start."""
+        self.agents = len(position)
+        self.position = np.ascontiguousarray(position, dtype=np.float32)
+        self.velocity = np.zeros_like(self.position)
+        self.steps = 0  # made so far
+        self._task = world.task
+        self._scenes = None if scenes is None else list(scenes)  # each agent's own
+        if self._scenes is None:
+            self.kernel, self._grounds = world.kernel, world.grounds
+        else:
+            self._make_room(room_for(self._scenes, _SPARE))
+            self._write_scenes(range(self.agents))
+        self.memory = aligned(self.blocks, self.kernel.size(State))
+        self.brains = aligned(self.blocks, self.kernel.size(Brain))
+        self.results = aligned(self.blocks, self.kernel.size(Result))
+
+    @property
+    def blocks(self) -> int:
+        return -(-self.agents // WIDTH)
+
+    @property
+    def own_scenes(self) -> bool:
+        return self._scenes is not None
+
+    def think(self, weights: np.ndarray, biases: np.ndarray) -> None:
+        """Gives the agents their controllers: weights [agent, output, input], biases [agent, output]."""
+        lanes = np.minimum(np.arange(self.blocks * WIDTH), self.agents - 1)  # the last agent in lanes left over
+        for brain, agents in zip(self.brains, lanes.reshape(-1, WIDTH), strict=True):
+            self.kernel.field(brain, Brain, "weight")[:] = weights[agents].reshape(WIDTH, -1).T
+            self.kernel.field(brain, Brain, "bias")[:] = biases[agents].T
+
+    def trace(self, steps: int) -> np.ndarray:
+        """Room for a recording of the first block, float32 [step + 1, row, lane]."""
+        body = self.kernel.lengths
+        row = 5 * body["mass"] + body["spring"] + body["chamber"] + body["input"]
+        return aligned(steps + 1, row * WIDTH).reshape(steps + 1, row, WIDTH)
+
+    def run(
+        self,
+        drive: int,
+        steps: int,
+        last: int,
+        *,
+        fresh: np.ndarray = _NOBODY,
+        script: np.ndarray | None = None,
+        trace: np.ndarray | None = None,
+        commands: np.ndarray = _NO_ROWS,
+        observations: np.ndarray = _NO_ROWS,
+        stands: np.ndarray = _NO_ROWS,
+    ) -> None:
+        """Puts the agents that are `fresh` [agent] at the start, then runs `steps` steps; `last` is the task's last.
+
+        `script` [step, row] is for all agents, `commands` [agent, output] for each. Fills `trace` (a row for
+        the start of fresh agents, a row a step), and in the end
+        `observations` [agent, input] and `stands` [agent, stand].
+        """
+        scripts = _NO_SCRIPT
+        if script is not None:
+            scripts = aligned(1, script.size * WIDTH)
+            scripts[0] = np.repeat(script.ravel(), WIDTH)
+        traces = _NO_TRACE if trace is None else trace.reshape(1, -1)
+        assert traces.ctypes.data % LINE == 0 or not traces.size  # the kernel moves whole cache lines
+        kernel = self.kernel
+        run_blocks(
+            _width(), kernel.settings, kernel.tables, self._grounds, self.memory, self.brains, scripts, traces,
+            self.results, kernel.layouts, fresh, self.position, self.velocity, commands, observations, stands,
+            drive, self.steps, steps, last,
+        )  # fmt: skip
+        self.steps += steps
+
+    def begin(self, drive: int = CONTROLLER, **outputs: Any) -> None:
+        """Puts all agents at the start."""
+        self.run(drive, 0, -1, fresh=np.ones(self.agents, dtype=bool), **outputs)
+
+    def restart(self, fresh: np.ndarray, scenes: dict[int, Columns], **outputs: Any) -> None:
+        """Puts the agents that are `fresh` [agent] back at the start, at `self.position`, on `scenes` [agent] of their
+        own; the others stay as they are."""
+        if scenes:
+            assert self._scenes is not None
+            for agent, columns in scenes.items():
+                self._scenes[agent] = columns
+            needed = room_for(list(scenes.values()))
+            if self._room.holds(needed):
+                self._write_scenes(scenes)
+            else:
+                self._grow(room_for(self._scenes, _SPARE))
+        self.run(COMMANDS, 0, -1, fresh=fresh, **outputs)
+
+    def look(self) -> tuple[np.ndarray, np.ndarray]:
+        """Observations [agent, input] and stands [agent, stand] (see `Kernel.stand`), in arrays of their own."""
+        observations, stands = self.kernel.rows_for(self.agents)
+        self.run(COMMANDS, 0, -1, observations=observations, stands=stands)
+        return observations, stands
+
+    def result(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Final positions [agent, mass, 2], steps [agent], solved [agent]."""
+        final = np.stack([self._rows(name) for name in ("x", "y")], axis=2)
+        steps = self._rows("steps")[:, 0].astype(np.int64)
+        return final, steps, self._rows("solved")[:, 0] > 0
+
+    def _rows(self, name: str) -> np.ndarray:
+        """A field of the results as [agent, length]."""
+        blocks = [self.kernel.field(buffer, Result, name).T for buffer in self.results]
+        return np.concatenate(blocks)[: self.agents]
+
+    def _make_room(self, room: Room) -> None:
+        self._room = room
+        self.kernel = make_kernel(self._task, room, own_ground=True)
+        self._grounds = aligned(self.blocks, self.kernel.size(Ground))
+
+    def _write_scenes(self, agents: Iterable[int]) -> None:
+        assert self._scenes is not None
+        for agent in agents:
+            write_ground(self.kernel, self._grounds[agent // WIDTH], self._scenes[agent], agent % WIDTH)
+        for lane in range(self.agents % WIDTH, WIDTH if self.agents % WIDTH else 0):  # left over: the last agent again
+            write_ground(self.kernel, self._grounds[-1], self._scenes[-1], lane)
+
+    def _grow(self, room: Room) -> None:
+        """Makes room for larger scenes; what moves is taken along."""
+        before, memory = self.kernel, self.memory
+        slots, columns = before.settings.slots, before.settings.columns
+        self._make_room(room)
+        self._write_scenes(range(self.agents))
+        self.memory = aligned(self.blocks, self.kernel.size(State))
+        lanes = np.arange(WIDTH, dtype=np.int32)
+        shift = lanes * (self.kernel.lengths["segment"] - before.lengths["segment"]) // WIDTH
+        for old, new in zip(memory, self.memory, strict=True):
+            for name, (_, length) in fields(State).items():
+                was, now = before.field(old, State, name), self.kernel.field(new, State, name)
+                if length == "slot":
+                    was = was.reshape(-1, slots, *was.shape[1:])
+                    now = now.reshape(len(was), -1, *now.shape[1:])
+                    if name == "segment":
+                        now[:] = UNKNOWN
+                        was = np.where(was < 0, was, was + shift)
+                    now[:, :slots] = was
+                else:
+                    now[:] = was
+            self.kernel.field(new, State, "cell")[:] += lanes * (room.columns - columns)
+            self.kernel.field(new, Work, "mean")[:] = before.field(old, Work, "mean")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        for name in ("memory", "brains", "results", "_grounds"):  # copies lie anywhere
+            buffer = state[name]
+            vars(self)[name] = aligned(*buffer.shape)
+            vars(self)[name][:] = buffer
+
+
+@lru_cache
+def _width() -> Width:
+    """The kernel's width, marked with its sources."""
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    return Width(WIDTH, hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:12])
+
+
+@lru_cache
+def load_kernel() -> None:
+    """Has the kernel ready, compiled or from the cache; says so if that takes a while."""
+    said = "turgor: compiling the engine for this processor, once ..."
+    notice = threading.Timer(1.5, print, [said], {"file": sys.stderr, "flush": True})
+    notice.daemon = True
+    notice.start()
+    body = Body([[0.0, 0.0]])
+    task = Task(name="nothing", body=body, scene=Scene([]), position=body.position, condition="passive")
+    try:
+        Batch(World(task), np.zeros((0, 1, 2))).run(CONTROLLER, 0, 0)
+    finally:
+        notice.cancel()
