@@ -111,7 +111,7 @@ REFUSED: dict[str, tuple[Any, str, str]] = {
         "[1, 10, 2]",
     ),
     "commands of another body": (lambda: stepped(np.zeros((2, 10))), "commands: expected shape", "[2, 10]"),
-    "commands of NaN": (lambda: stepped(np.full((2, 11), math.nan)), "commands: expected shape", "[2, 11]"),
+    "commands of NaN": (lambda: stepped(np.full((2, 11), math.nan)), "commands: expected finite", "[2, 11]"),
     "lengths of another body": (
         lambda: replay(SMALL, flat(), np.ones((5, 9))),
         "rest_length: expected finite numbers of shape [5, 10]",

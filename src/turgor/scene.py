@@ -157,9 +157,8 @@ def cage(
 
 def highest_ground(scene: Scene, left: float, right: float) -> float:
     """Highest y [m] of the ground (segments with a depth) between x = `left` and x = `right`; 0 without any."""
-    heights = []
-    for (x1, y1, x2, y2), depth in zip(scene.segments, scene.depth, strict=True):
-        low, high = max(left, min(x1, x2)), min(right, max(x1, x2))
-        if depth > 0 and low <= high and x1 != x2:
-            heights += [y1 + (y2 - y1) * (x - x1) / (x2 - x1) for x in (low, high)]
-    return max(heights, default=0.0)
+    x1, y1, x2, y2 = scene.segments.T
+    low, high = np.maximum(left, np.minimum(x1, x2)), np.minimum(right, np.maximum(x1, x2))
+    under = (scene.depth > 0) & (low <= high) & (x1 != x2)
+    heights = [y1[under] + (y2 - y1)[under] * (x[under] - x1[under]) / (x2 - x1)[under] for x in (low, high)]
+    return float(np.max(heights)) if under.any() else 0.0

@@ -10,6 +10,7 @@ import hashlib
 import inspect
 import math
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -198,10 +199,13 @@ def _grouped(variants: Mapping[str, Any]) -> dict[type, Any]:
             raise one_of("variant", sorted(known), name)
     groups = {}
     for group in VARIANT_GROUPS:
-        hints = get_type_hints(group)
+        hints = _hints(group)
         chosen = {name: _checked(name, value, hints[name]) for name, value in variants.items() if known[name] is group}
         groups[group] = group(**chosen)
     return groups
+
+
+_hints = cache(get_type_hints)
 
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
