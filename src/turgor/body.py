@@ -72,6 +72,11 @@ class Body(msgspec.Struct, frozen=True, eq=False, kw_only=False):
                 f"{describe(self.shortest.max())} and {describe(self.longest.min())}",
             )
 
+    def __repr__(self) -> str:
+        chambers = f"{self.chamber_count} chamber" + "s" * (self.chamber_count != 1)
+        counts = f"{self.mass_count} masses, {self.spring_count} springs, {chambers}"
+        return f"Body({counts}, radius {self.radius:g} m, {self.mass.sum():g} kg)"
+
     @property
     def mass_count(self) -> int:
         return len(self.position)

@@ -29,6 +29,10 @@ class Recording(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     fitness: float | None = None
     solved: bool = False
 
+    def __repr__(self) -> str:
+        fitness = "" if self.fitness is None else f", fitness {self.fitness:.3f}" + ", solved" * self.solved
+        return f"Recording({self.steps} steps, {self.steps * self.dt:.1f} s, of {self.body}{fitness})"
+
     @property
     def steps(self) -> int:
         return len(self.position) - 1

@@ -61,6 +61,10 @@ class Champion(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     robust: Any = None  # [repeat], its fitness from slightly moved starts; None: not measured yet
     robust_solved: Any = None  # [repeat], bool
 
+    def __repr__(self) -> str:
+        robust = "" if self.robust_fitness is None else f", robust {self.robust_fitness:.3f}"
+        return f"Champion(fitness {self.fitness:.3f}{robust}, generation {self.generation})"
+
     @property
     def robust_fitness(self) -> float | None:
         """Median fitness from slightly moved starts."""
@@ -105,6 +109,10 @@ class Run:
         self.seconds: dict[str, float] = {}  # where the time went, `total` included
         self.versions = current_versions()
         self._growing: TextIO | None = None
+
+    def __repr__(self) -> str:
+        where = "in memory" if self.path is None else f"in {self.path}"
+        return f"Run({self.task.name}, {self.status}, {self.evaluations} evaluations, {self.champion}, {where})"
 
     @classmethod
     def create(cls, task: Task, settings: Settings, path: str | os.PathLike[str] | None) -> Run:

@@ -51,6 +51,13 @@ class Scene(msgspec.Struct, frozen=True, eq=False):
         msgspec.structs.force_setattr(self, "depth", depth)
         msgspec.structs.force_setattr(self, "friction", float(self.friction))
 
+    def __repr__(self) -> str:
+        if not len(self.segments):
+            return "Scene(empty)"
+        x, y = self.segments[:, ::2], self.segments[:, 1::2]
+        spans = f"x {x.min():.6g} to {x.max():.6g} m, y {y.min():.6g} to {y.max():.6g} m"
+        return f"Scene({len(self.segments)} segments, {spans}, friction {self.friction:g})"
+
     @property
     def normal(self) -> np.ndarray:
         """Outward unit normals [1], shape [segment, 2]: (dy, -dx) / length."""

@@ -35,6 +35,15 @@ class Rollout(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     start: Any  # [m], shape [agent, 2], centre of mass at the start
     position: Any  # [m], shape [agent, mass, 2], final
 
+    def __repr__(self) -> str:
+        if not np.isfinite(self.fitness).any():
+            return f"Rollout({len(self.fitness)} agents, none with a fitness)"
+        low, median, high = np.nanmin(self.fitness), np.nanmedian(self.fitness), np.nanmax(self.fitness)
+        return (
+            f"Rollout({len(self.fitness)} agents, fitness {low:.3f} to {high:.3f}, median {median:.3f}, "
+            f"{int(np.sum(self.solved))} solved)"
+        )
+
 
 class Step(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Where a batch of agents stands between two steps; every field is per agent."""
@@ -46,6 +55,10 @@ class Step(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     touch: Any  # 0 or 1, shape [agent, mass]: whether it touched something in the last step
     pressure: Any  # [Pa], shape [agent, chamber]
     area: Any  # [m^2], shape [agent, chamber], signed
+
+    def __repr__(self) -> str:
+        agents, masses, _ = self.position.shape
+        return f"Step({agents} agents of {masses} masses, {int(self.solved.sum())} solved)"
 
     @property
     def solved(self) -> np.ndarray:
@@ -64,6 +77,9 @@ class Simulator:
         self.threads = threads or available_cores()
         self._world = World(task)
         self._stepping: list[tuple[Batch, slice]] = []  # the agents that `step` drives, in parts
+
+    def __repr__(self) -> str:
+        return f"Simulator({self.task}, threads={self.threads})"
 
     def rollout(self, theta: ArrayLike, position: ArrayLike | None = None) -> Rollout:
         """A `Rollout` of every row of `theta` [agent, parameter] from the task's start, or from `position` [m],

@@ -81,6 +81,12 @@ class Task(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         if (self.condition == "pressure" or self.fitness == "area") and not self.body.chamber_count:
             raise InvalidInput('condition "pressure" and fitness "area": expected a body with a chamber', "none")
 
+    def __repr__(self) -> str:
+        return (
+            f"Task({self.name!r}, {self.body}, condition {self.condition!r}, {self.parameter_count} parameters, "
+            f"{self.steps} steps, {self.duration:.1f} s)"
+        )
+
     @property
     def parameter_count(self) -> int:
         """Length of a controller's theta."""
