@@ -31,7 +31,7 @@ class Recording(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
     def __repr__(self) -> str:
         fitness = "" if self.fitness is None else f", fitness {self.fitness:.3f}" + ", solved" * self.solved
-        return f"Recording({self.steps} steps, {self.steps * self.dt:.1f} s, of {self.body}{fitness})"
+        return f"Recording({self.steps} steps, {self.steps * self.dt:.1f} s, {self.body.mass_count} masses{fitness})"
 
     @property
     def steps(self) -> int:

@@ -83,8 +83,8 @@ class Task(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
     def __repr__(self) -> str:
         return (
-            f"Task({self.name!r}, {self.body}, condition {self.condition!r}, {self.parameter_count} parameters, "
-            f"{self.steps} steps, {self.duration:.1f} s)"
+            f"Task({self.name!r}, body of {self.body.mass_count} masses, condition {self.condition!r}, "
+            f"{self.parameter_count} parameters, {self.duration:.1f} s)"
         )
 
     @property
