@@ -8,6 +8,8 @@ run = turgor.evolve(task, evaluations=10_000, out="runs/first")
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from turgor.envs.registration import register_on_import
+
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
@@ -58,6 +60,8 @@ _HOME = {
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 __all__ = sorted(_MODULE)
+
+register_on_import()
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,1 @@
+"""Gymnasium environments: the tasks, step by step, for reinforcement learning."""
