@@ -11,6 +11,7 @@ from typing import Any
 
 import av
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from gymnasium import error
@@ -317,9 +318,7 @@ def test_camera_follows() -> None:
     canvas, stand = Canvas(task, (320, 180)), turgor.Simulator(task).reset(1)
     for t in range(120):
         moved = stand.position + np.float32([0.5 * t, 3 * np.sin(t / 5)])
-        canvas.add(
-            turgor.Step(**{k: getattr(stand, k) for k in stand.__struct_fields__} | {"position": moved}), [False]
-        )
+        canvas.add(msgspec.structs.replace(stand, position=moved))
         pixels = canvas.painter.camera.pixels(t, moved[0])
         assert (pixels > 0).all()
         assert (pixels < (320, 180)).all()

@@ -18,6 +18,7 @@ class Canvas:
     """Draws one episode of `task`, which grows by `add`."""
 
     def __init__(self, task: Task, size: tuple[int, int]) -> None:
+        self.task, self.size = task, size
         body, rows = task.body, task.steps + 1
         self.recording = Recording(
             body=body,
@@ -29,17 +30,20 @@ class Canvas:
             rest_length=np.broadcast_to(body.rest_length, (rows, body.spring_count)),
             touch=np.zeros((rows, body.mass_count), dtype=bool),
         )
-        limits = task.pressure_range
-        span = (float(limits[:, 0].min()), float(limits[:, 1].max())) if np.ptp(limits) > 0 else None
-        self.painter = Painter(self.recording, size, pressure_range=span)
+        self.painter = self._painter()
         self.last = -1  # the step that was added last
 
-    def add(self, stand: Step, touch: np.ndarray) -> None:
-        """Takes in where the agent stands after the next step; `touch` [mass]."""
+    def _painter(self) -> Painter:
+        limits = self.task.pressure_range
+        span = (float(limits[:, 0].min()), float(limits[:, 1].max())) if np.ptp(limits) > 0 else None
+        return Painter(self.recording, self.size, pressure_range=span)
+
+    def add(self, stand: Step, agent: int = 0) -> None:
+        """Takes in where the agent stands after the next step."""
         self.last += 1
         t, recording, painter = self.last, self.recording, self.painter
-        recording.position[t], recording.velocity[t] = stand.position[0], stand.velocity[0]
-        recording.pressure[t], recording.touch[t] = stand.pressure[0], touch
+        recording.position[t], recording.velocity[t] = stand.position[agent], stand.velocity[agent]
+        recording.pressure[t], recording.touch[t] = stand.pressure[agent], stand.touch[agent] > 0
         com = np.average(recording.position[t].astype(np.float64), axis=0, weights=recording.body.mass)
         painter.com[t] = com
         painter.camera.centre[t] = self._aim(com)
@@ -62,6 +66,19 @@ class Canvas:
         share = [1 - math.exp(-self.recording.dt / constant) for constant in CAMERA_SMOOTHING]
         slack = CAMERA_SLACK * np.array(camera.size) / camera.scale
         return com + np.clip(before + share * (com - before) - com, -slack, slack)
+
+
+    # pygame's surfaces cannot be copied; what they are drawn from can
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = {name: value for name, value in vars(self).items() if name != "painter"}
+        return state | {"com": self.painter.com, "centre": self.painter.camera.centre}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        com, centre = state.pop("com"), state.pop("centre")
+        vars(self).update(state)
+        self.painter = self._painter()
+        self.painter.com[:], self.painter.camera.centre[:] = com, centre
 
 
 class Window:

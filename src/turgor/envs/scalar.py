@@ -55,7 +55,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         self._task = self._rules.task(seed_terrain or 0)
         self._spec: EnvSpec | None = None
         self._terrain: int | None = None  # of the present episode; None: before the first reset
-        self._actions: list[np.ndarray] = []  # commands of the present episode
+        self._steps = 0  # of the present episode
         self._over = False
         self._canvas: Canvas | None = None
         self._window: Window | None = None
@@ -101,7 +101,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         score = self._score(stand)
         reward, self._gain = score.gain - self._gain, score.gain
         terminated = bool(stand.solved[0])
-        truncated = len(self._actions) >= self._task.steps
+        truncated = self._steps >= self._task.steps
         self._over = terminated or truncated
         info = self._info(stand, score.fitness)
         self._show()
@@ -132,28 +132,28 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
             self._terrain = terrain
         stand = self._simulator.reset(1)
         self._start = tasks.centre(self._task, stand.position)
-        self._gain, self._actions, self._over = np.zeros(1), [], False
+        self._gain, self._steps, self._over = np.zeros(1), 0, False
         self._canvas = None if self.render_mode is None else Canvas(self._task, self.render_size)
         self._film(stand)
         return stand
 
     def _advance(self, commands: np.ndarray) -> Step:
         """One step of the simulator."""
-        self._actions.append(commands)
+        self._steps += 1
         stand = self._simulator.step(commands[None])
         self._film(stand)
         return stand
 
     def _score(self, stand: Step) -> tasks.Score:
-        return tasks.score(self._task, stand.position, self._start, np.array([len(self._actions)]))
+        return tasks.score(self._task, stand.position, self._start, np.array([self._steps]))
 
     def _info(self, stand: Step, fitness: np.ndarray) -> dict[str, Any]:
-        told = tasks.infos(self._task, stand, tasks.touching(self._simulator), fitness)
+        told = tasks.infos(self._task, stand, fitness)
         return {name: values[0].copy() if values.ndim > 1 else values[0].item() for name, values in told.items()}
 
     def _film(self, stand: Step) -> None:
         if self._canvas is not None:
-            self._canvas.add(stand, tasks.touching(self._simulator)[0])
+            self._canvas.add(stand)
 
     def _show(self) -> None:
         """The present picture in the window, opened when first needed."""
@@ -163,17 +163,5 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
                 self._window = Window(self.render_size, title, self.metadata["render_fps"])
             self._window.show(self._canvas.surface())
 
-    # The simulator's memory is no part of a copy, which takes the present episode's steps again instead.
-
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_simulator", "_canvas", "_window")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__ |= state | {"_canvas": None, "_window": None}
-        terrain, actions = self._terrain, self._actions
-        if terrain is not None:
-            gain, over, self._terrain = self._gain, self._over, None
-            self._begin(terrain)
-            for commands in actions:
-                self._advance(commands)
-            self._gain, self._over = gain, over
+        return vars(self) | {"_window": None}

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from turgor.body import Body
 from turgor.control import observation_count, output_count
 from turgor.errors import InvalidInput, describe, one_of
-from turgor.simulate import Simulator, Step
+from turgor.simulate import Step
 from turgor.task import Task, make_task
 from turgor.variants import Condition, variant_names
 
@@ -115,9 +115,9 @@ def commands(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def observations(stand: Step) -> np.ndarray:
-    """What the agents see, float32 [agent, input]: the kernel's numbers, none beyond 1. (The window's running sum
-    can be a rounding larger than its terms allow.)"""
-    return np.clip(stand.observation, -1.0, 1.0)
+    """What the agents see, float32 [agent, input]: the kernel's own array, its numbers cut at 1. (The window's running
+    sum can be a rounding larger than its terms allow.)"""
+    return np.clip(stand.observation, -1.0, 1.0, out=stand.observation)
 
 
 # --- what has been achieved ---------------------------------------------------------------------------------------
@@ -157,23 +157,15 @@ def area_ratio(task: Task, position: np.ndarray) -> np.ndarray:
     return task.body.area(position.astype(np.float64)) / task.area_reference
 
 
-def touching(simulator: Simulator) -> np.ndarray:
-    """Which masses touch something, bool [agent, mass]."""
-    # TO BE REPLACED by `Step.touch`: until a Step carries it, it is read from the kernel's memory.
-    from turgor.physics.model import State
-
-    return np.concatenate([batch._rows(batch.memory, State, "touch") for batch in simulator._stepping]) > 0
-
-
-def infos(task: Task, stand: Step, touch: np.ndarray, fitness: np.ndarray) -> dict[str, np.ndarray]:
+def infos(task: Task, stand: Step, fitness: np.ndarray) -> dict[str, np.ndarray]:
     """What is told beside the observation, every value [agent], or [agent, chamber] for bodies that do not have
     exactly one chamber."""
     chambers = 0 if task.body.chamber_count == 1 else slice(None)
     told = {
         "fitness": fitness,  # so far
-        "area_ratio": area_ratio(task, stand.position)[:, chambers],
+        "area_ratio": (stand.area / task.area_reference)[:, chambers],
         "pressure": stand.pressure.astype(np.float64)[:, chambers],  # [Pa]
-        "contacts": touch.sum(axis=1),  # masses that touch something
+        "contacts": stand.touch.sum(axis=1).astype(np.int64),  # masses that touch something
     }
     if task.end is not None:
         told["is_success"] = stand.solved
