@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -77,6 +78,8 @@ class Simulator:
         self.threads = threads or available_cores()
         self._world = World(task)
         self._stepping: list[tuple[Batch, slice]] = []  # the agents that `step` drives, in parts
+        stand = self._world.kernel.stand
+        self._columns = [(name, *place) for name, place in stand.items() if name in Step.__struct_fields__]
 
     def __repr__(self) -> str:
         return f"Simulator({self.task}, threads={self.threads})"
@@ -189,8 +192,7 @@ class Simulator:
         agents, kernel = self._stepping[-1][1].stop, self._world.kernel
         if out is None:
             observation, stand = kernel.rows_for(agents)
-            fields = {name: stand[:, c].reshape(agents, *shape) for name, (c, shape) in kernel.stand.items()}
-            del fields["solved"]
+            fields = {name: stand[:, c].reshape(agents, *shape) for name, c, shape in self._columns}
             return Step(observation=observation, stand=stand, **fields)
         if out.observation.shape != (agents, kernel.lengths["input"]):
             raise InvalidInput(f"out: expected a Step of these {agents} agents", f"{len(out.observation)} agents")
@@ -251,13 +253,24 @@ class Simulator:
         return starts.astype(np.float32) + np.float32(0)  # no negative zeros
 
     def _spread(self, run: Callable[[Any], None], parts: list[Any]) -> None:
-        """Runs every part, over the threads."""
+        """Runs every part, over the threads, of which the caller's is one."""
         load_kernel()
-        if self.threads == 1 or len(parts) == 1:
-            for part in parts:
+        todo = deque(parts)
+
+        def work() -> None:
+            while todo:
+                try:
+                    part = todo.popleft()
+                except IndexError:  # another thread was faster
+                    return
                 run(part)
-        else:
-            list(_pool(self.threads).map(run, parts))
+
+        helpers = [_pool(self.threads).submit(work) for _ in range(min(self.threads, len(parts)) - 1)]
+        try:
+            work()
+        finally:
+            for helper in helpers:
+                helper.result()
 
     def _judge(self, starts: np.ndarray, final: np.ndarray, steps: np.ndarray, solved: np.ndarray) -> Rollout:
         task = self.task

@@ -23,7 +23,12 @@ def register() -> None:
 
     for name, task in ENVIRONMENTS.items():
         if name not in registration.registry:
-            registration.register(name, entry_point="turgor.envs.scalar:Env", kwargs={"task": task})
+            registration.register(
+                name,
+                entry_point="turgor.envs.scalar:Env",
+                vector_entry_point="turgor.envs.vector:VectorEnv",
+                kwargs={"task": task},
+            )
 
 
 def register_on_import() -> None:

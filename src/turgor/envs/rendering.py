@@ -67,7 +67,6 @@ class Canvas:
         slack = CAMERA_SLACK * np.array(camera.size) / camera.scale
         return com + np.clip(before + share * (com - before) - com, -slack, slack)
 
-
     # pygame's surfaces cannot be copied; what they are drawn from can
 
     def __getstate__(self) -> dict[str, Any]:

@@ -128,10 +128,10 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         """Puts the agent at the start on that terrain."""
         if terrain != self._terrain:
             self._task = self._rules.task(terrain)
-            self._simulator = Simulator(self._task, threads=1)
+            self._simulator, self._measure = Simulator(self._task, threads=1), tasks.Measure(self._task)
             self._terrain = terrain
         stand = self._simulator.reset(1)
-        self._start = tasks.centre(self._task, stand.position)
+        self._start = self._measure.centre(stand.position)
         self._gain, self._steps, self._over = np.zeros(1), 0, False
         self._canvas = None if self.render_mode is None else Canvas(self._task, self.render_size)
         self._film(stand)
@@ -145,10 +145,10 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         return stand
 
     def _score(self, stand: Step) -> tasks.Score:
-        return tasks.score(self._task, stand.position, self._start, np.array([self._steps]))
+        return self._measure.score(stand.position, self._start, np.array([self._steps]))
 
     def _info(self, stand: Step, fitness: np.ndarray) -> dict[str, Any]:
-        told = tasks.infos(self._task, stand, fitness)
+        told = self._measure.infos(stand, fitness)
         return {name: values[0].copy() if values.ndim > 1 else values[0].item() for name, values in told.items()}
 
     def _film(self, stand: Step) -> None:

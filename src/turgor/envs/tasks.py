@@ -130,43 +130,45 @@ class Score(msgspec.Struct, frozen=True, eq=False):
     gain: Any  # fitness times the time that it is measured over; a step's reward is what is gained in it
 
 
-def centre(task: Task, position: np.ndarray) -> np.ndarray:
-    """x of the centres of mass [m], float64 [agent]. Summed mass by mass: NumPy's sums add in an order that depends on
-    the batch."""
-    share = task.body.mass / task.body.mass.sum()
-    x = np.zeros(len(position))
-    for m, part in enumerate(share.tolist()):
-        x += part * position[:, m, 0].astype(np.float64)
-    return x
+class Measure:
+    """Measures how far agents of a task have come."""
 
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self._share = (task.body.mass / task.body.mass.sum()).tolist()
+        self._disc = task.area_reference
+        self._chambers = 0 if task.body.chamber_count == 1 else slice(None)
 
-def score(task: Task, position: np.ndarray, start: np.ndarray, steps: np.ndarray) -> Score:
-    """The `Score` of agents at `position` [m], shape [agent, mass, 2], that began with their centres of mass at
-    `start` [m] [agent] and made `steps` [agent]."""
-    if task.fitness == "area":
-        ratio = area_ratio(task, position)[:, 0]
-        return Score(ratio, task.duration * ratio)
-    travel = centre(task, position) - start
-    gain = travel if task.fitness == "progress" else np.abs(travel)
-    time = np.maximum(steps, 1) * task.physics.dt if task.fitness == "elapsed" else task.duration
-    return Score(gain / time, gain)
+    def centre(self, position: np.ndarray) -> np.ndarray:
+        """x of the centres of mass [m], float64 [agent]. Summed mass by mass: NumPy's sums add in an order that
+        depends on the batch."""
+        masses = np.ascontiguousarray(position[:, :, 0].T, dtype=np.float64)
+        x = np.zeros(len(position))
+        for share, of_mass in zip(self._share, masses, strict=True):
+            x += share * of_mass
+        return x
 
+    def score(self, position: np.ndarray, start: np.ndarray, steps: np.ndarray) -> Score:
+        """The `Score` of agents at `position` [m], shape [agent, mass, 2], that began with their centres of mass at
+        `start` [m] [agent] and made `steps` [agent]."""
+        task = self.task
+        if task.fitness == "area":
+            ratio = task.body.area(position.astype(np.float64))[:, 0] / self._disc[0]
+            return Score(ratio, task.duration * ratio)
+        travel = self.centre(position) - start
+        gain = travel if task.fitness == "progress" else np.abs(travel)
+        time = np.maximum(steps, 1) * task.physics.dt if task.fitness == "elapsed" else task.duration
+        return Score(gain / time, gain)
 
-def area_ratio(task: Task, position: np.ndarray) -> np.ndarray:
-    """rho = area / (pi r^2) of each chamber [1], float64 [agent, chamber]."""
-    return task.body.area(position.astype(np.float64)) / task.area_reference
-
-
-def infos(task: Task, stand: Step, fitness: np.ndarray) -> dict[str, np.ndarray]:
-    """What is told beside the observation, every value [agent], or [agent, chamber] for bodies that do not have
-    exactly one chamber."""
-    chambers = 0 if task.body.chamber_count == 1 else slice(None)
-    told = {
-        "fitness": fitness,  # so far
-        "area_ratio": (stand.area / task.area_reference)[:, chambers],
-        "pressure": stand.pressure.astype(np.float64)[:, chambers],  # [Pa]
-        "contacts": stand.touch.sum(axis=1).astype(np.int64),  # masses that touch something
-    }
-    if task.end is not None:
-        told["is_success"] = stand.solved
-    return told
+    def infos(self, stand: Step, fitness: np.ndarray) -> dict[str, np.ndarray]:
+        """What is told beside the observation, every value [agent], or [agent, chamber] for bodies that do not have
+        exactly one chamber."""
+        told = {
+            "fitness": fitness,  # so far
+            "area_ratio": (stand.area / self._disc)[:, self._chambers],
+            "pressure": stand.pressure.astype(np.float64)[:, self._chambers],  # [Pa]
+            "contacts": stand.touch.sum(axis=1).astype(np.int64),  # masses that touch something
+        }
+        if self.task.end is not None:
+            told["is_success"] = stand.solved
+        return told

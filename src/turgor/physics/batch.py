@@ -17,7 +17,7 @@ from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, roo
 from turgor.physics.memory import LINE, Width, aligned, fields
 from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
 from turgor.physics.step import run_blocks
-from turgor.physics.tables import make_kernel, write_ground
+from turgor.physics.tables import ground_tables, make_kernel, write_ground
 from turgor.scene import Scene
 from turgor.task import Task
 
@@ -36,7 +36,7 @@ class World:
         self.columns = self.cut(task.scene)
         self.kernel = make_kernel(task, room_for([self.columns]))
         self.grounds = aligned(1, self.kernel.size(Ground))
-        write_ground(self.kernel, self.grounds[0], self.columns)
+        write_ground(ground_tables(self.kernel, self.grounds[0]), self.columns)
 
     def cut(self, scene: Scene) -> Columns:
         """The columns of a `scene` for the task's body."""
@@ -162,10 +162,11 @@ class Batch:
 
     def _write_scenes(self, agents: Iterable[int]) -> None:
         assert self._scenes is not None
+        tables = [ground_tables(self.kernel, ground) for ground in self._grounds]
         for agent in agents:
-            write_ground(self.kernel, self._grounds[agent // WIDTH], self._scenes[agent], agent % WIDTH)
+            write_ground(tables[agent // WIDTH], self._scenes[agent], agent % WIDTH)
         for lane in range(self.agents % WIDTH, WIDTH if self.agents % WIDTH else 0):  # left over: the last agent again
-            write_ground(self.kernel, self._grounds[-1], self._scenes[-1], lane)
+            write_ground(tables[-1], self._scenes[-1], lane)
 
     def _grow(self, room: Room) -> None:
         """Makes room for larger scenes; what moves is taken along."""

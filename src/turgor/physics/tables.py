@@ -52,7 +52,7 @@ class Kernel(NamedTuple):
 
     def rows_for(self, agents: int) -> tuple[np.ndarray, np.ndarray]:
         """Room for what `hand_out` writes: observations [agent, input] and stands [agent, stand], not filled."""
-        width = max(columns.stop for columns, _ in self.stand.values())
+        width = 5 * self.lengths["mass"] + 2 * self.lengths["chamber"] + 1
         return np.empty((agents, self.lengths["input"]), np.float32), np.empty((agents, width), np.float32)
 
     @property
@@ -139,35 +139,35 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
     )
     kernel = Kernel(settings, buffer, layouts, lengths)
     for name, values in tables.items():
-        kernel.field(buffer, Model, name)[:] = in_float32(name, values)
+        if (np.isfinite(values) & (np.abs(values) > LARGEST)).any():
+            raise InvalidInput(f"{name}: expected numbers within {LARGEST:.0e}", f"{np.abs(values).max():.3g}")
+        kernel.field(buffer, Model, name)[:] = values
     return kernel
 
 
-def write_ground(kernel: Kernel, buffer: np.ndarray, scene: Columns, place: int = 0) -> None:
-    """Writes a scene into a block's ground `buffer`; `place` is the lane, where each has one of its own."""
+def ground_tables(kernel: Kernel, buffer: np.ndarray) -> dict[str, np.ndarray]:
+    """The tables of a block's ground `buffer`, writable: {field: [scene, length]}."""
     scenes = WIDTH if kernel.settings.own_ground else 1
-    columns, slots = kernel.settings.columns.item(), kernel.settings.slots.item()
-    candidate = np.full((columns, slots), NOWHERE)
-    known = candidate[: len(scene.candidate), : scene.candidate.shape[1]]
-    # the lanes' segments stand side by side
-    known[:] = np.where(
-        scene.candidate == NOWHERE, NOWHERE, scene.candidate + place * (kernel.lengths["segment"] // scenes)
-    )
-    for name, values in scene._replace(candidate=candidate.ravel())._asdict().items():
-        table = kernel.field(buffer, Ground, name).reshape(scenes, -1)[place]
-        table[: len(values)] = in_float32(name, values)
+    tables = {name: kernel.field(buffer, Ground, name).reshape(scenes, -1) for name in fields(Ground)}
+    return tables | {"candidate": tables["candidate"].reshape(scenes, -1, kernel.settings.slots)}
+
+
+def write_ground(tables: dict[str, np.ndarray], scene: Columns, place: int = 0) -> None:
+    """Writes a scene into `ground_tables`; `place` is the lane, where each has one of its own."""
+    for name, values in scene._asdict().items():
+        table = tables[name][place]
         table[len(values) :] = _BEYOND.get(name, 0)
+        if name == "candidate":
+            table[:] = NOWHERE
+            # the lanes' segments stand side by side
+            values = np.where(values == NOWHERE, NOWHERE, values + place * tables["x1"].shape[1])
+            table[: len(values), : values.shape[1]] = values
+        else:
+            table[: len(values)] = values
 
 
 # Columns that a scene leaves over are entered by nothing but a mass that has flown to infinity.
 _BEYOND = {"left": math.inf, "right": math.inf, "floor": -math.inf, "ceiling": math.inf}
-
-
-def in_float32(name: str, values: np.ndarray) -> np.ndarray:
-    """`values`; raises `InvalidInput` where a finite one is none in float32."""
-    if (np.isfinite(values) & (np.abs(values) > LARGEST)).any():
-        raise InvalidInput(f"{name}: expected numbers within {LARGEST:.0e}", f"{np.abs(values).max():.3g}")
-    return values
 
 
 def _layouts(lengths: dict[str, int]) -> np.ndarray:
