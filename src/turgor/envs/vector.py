@@ -214,7 +214,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._stand = self._simulator.restart(which, position, scenes=scenes, out=out)
         stand = self._stand
         self._start[fresh] = self._measure.centre(stand.position[fresh])
-        self._gain[fresh], self._steps[fresh], self._over[fresh] = 0.0, 0, False
+        self._gain[fresh], self._steps[fresh] = 0.0, 0
+        self._over = self._over & ~which
         if self.render_mode is not None:
             self._canvases = self._canvases or [Canvas(self._task, self.render_size)] * self.num_envs
             for k, agent in enumerate(fresh.tolist()):
