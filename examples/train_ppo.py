@@ -4,7 +4,6 @@ import argparse
 import csv
 
 import gymnasium
-from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor
@@ -39,12 +38,7 @@ class Curve(BaseCallback):
         self.file.close()
 
 
-agents = gymnasium.make_vec(
-    f"turgor/{options.task}-v0",
-    num_envs=options.agents,
-    vectorization_mode="sync",
-    vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-)
+agents = gymnasium.make_vec(f"turgor/{options.task}-v0", num_envs=options.agents, autoreset_mode="SameStep")
 model = PPO(
     "MlpPolicy",
     VecMonitor(SB3VecEnv(agents)),

@@ -21,11 +21,7 @@ from turgor.rl import SB3VecEnv
 
 
 def made(name: str, number: int = 3, mode: AutoresetMode = AutoresetMode.SAME_STEP, **keywords: Any) -> SB3VecEnv:
-    return SB3VecEnv(
-        gymnasium.make_vec(
-            name, num_envs=number, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **keywords
-        )
-    )
+    return SB3VecEnv(gymnasium.make_vec(name, num_envs=number, autoreset_mode=mode, **keywords))
 
 
 @pytest.mark.parametrize("name", ["turgor/Hilly-v0", "turgor/Escape-v0"])
