@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.abc
 import sys
-from collections.abc import Sequence
-from importlib.machinery import ModuleSpec
-from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
 
 ENVIRONMENTS = {
     "turgor/Hilly-v0": "hilly",
@@ -42,25 +43,26 @@ def register_on_import() -> None:
         sys.meta_path.insert(0, _WithGymnasium())
 
 
-class _WithGymnasium(importlib.abc.MetaPathFinder):
+# A finder and a loader by their methods alone: `importlib.abc` takes as long to import as the rest of turgor.
+
+
+class _WithGymnasium:
     """Leaves finding Gymnasium to the other finders; calls `register` after its import."""
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
         if fullname != "gymnasium":
             return None
         others = [finder.find_spec for finder in sys.meta_path if finder is not self and hasattr(finder, "find_spec")]
         spec = next((found for find in others if (found := find(fullname, path, target))), None)
         if spec is not None and spec.loader is not None:
-            spec.loader = _Registering(spec.loader)
+            spec.loader = _Registering(spec.loader)  # ty: ignore[invalid-assignment]
         return spec
 
 
-class _Registering(importlib.abc.Loader):
+class _Registering:
     """Puts the module's own loader back, lets it load, and calls `register`."""
 
-    def __init__(self, loader: importlib.abc.Loader) -> None:
+    def __init__(self, loader: Any) -> None:
         self.loader = loader
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
