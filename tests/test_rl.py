@@ -77,10 +77,11 @@ def test_attributes_are_shared() -> None:
     envs = made("turgor/Flat-v0")
     assert envs.get_attr("num_envs", [0, 2]) == [3, 3]
     assert not envs.has_attr("wheels")
+    envs.set_attr("has_wheels", lambda: True)
     envs.set_attr("wheels", 4)
     assert envs.get_attr("wheels") == [4, 4, 4]
     assert envs.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
-    assert envs.env_method("get_attr", "render_mode") == [(None,) * 3] * 3
+    assert envs.env_method("has_wheels") == [True] * 3
     for call in (lambda: envs.set_attr("wheels", 4, 0), lambda: envs.env_method("close", indices=[1])):
         with pytest.raises(InvalidInput, match="expected no indices"):
             call()
