@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -149,15 +150,12 @@ def _evolve(options: argparse.Namespace) -> None:
     chosen = {name: getattr(options, name) for name in variant_names()}
     variants = {name: value for name, value in chosen.items() if value is not None}
     task = make_task(options.task, body=options.body, condition=options.condition, seed=options.seed, **variants)
-    from functools import partial
-
     from turgor.evolution.loop import evolve
     from turgor.evolution.strategy import built_in
     from turgor.runs import check_new, free_folder
 
     given = {name: getattr(options, name) for name in ("population", "sigma") if getattr(options, name) is not None}
     strategy = partial(built_in(options.strategy), **given)
-
     out = options.out or free_folder(f"{task.name}-{options.body}-{task.condition}-s{options.seed}")
     check_new(out)
     recipe = {"name": task.name, "body": options.body, "condition": task.condition, "seed": options.seed, **variants}
