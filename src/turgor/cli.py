@@ -126,7 +126,7 @@ def _strategy_options(parser: Parser) -> None:
     add, names = parser.add_argument, ", ".join(STRATEGIES)
     add("--strategy", default="cma-es", metavar="NAME", help=f"the optimizer: {names} (default: cma-es)")
     add("--population", type=count, metavar="N", help="agents in a generation (default: 4 + floor(3 ln parameters))")
-    add("--sigma", type=number, metavar="X", help="its first step size [1] (default: 0.5; openai-es: 0.1)")
+    add("--sigma", type=number, metavar="X", help="its first step size [1] (default: 0.5; openai-es: 0.3)")
 
 
 def _resume_options(parser: Parser) -> None:

@@ -48,9 +48,9 @@ class OpenAIES:
         rng: np.random.Generator,
         *,
         population: int | None = None,
-        sigma: float = 0.1,
+        sigma: float = 0.3,
         mean: ArrayLike | None = None,
-        alpha: float = 0.05,
+        alpha: float = 0.1,
     ) -> None:
         """`population`: even, None for 4 + floor(3 ln parameter_count) or one more; `mean` [parameter]: None for
         uniform in [-1, 1]; `alpha`: what Adam moves a parameter by in a generation, at most about [1].
