@@ -32,7 +32,7 @@ axes = (figure := Figure(figsize=(11, 7), layout="constrained")).subplots()
 for (c, r, name), fitness in zip(cells, elites["objective"], strict=True):
     grid[r, c], middle = fitness, (edges[0][c : c + 2].mean(), edges[1][r : r + 2].mean())
     color = "white" if fitness < elites["objective"].max() * 0.6 else "black"
-    axes.annotate(f"{name}\n{fitness:.1f}", middle, ha="center", va="center", size=8, color=color)
+    axes.annotate(f"{name}\n{fitness:z.1f}", middle, ha="center", va="center", size=8, color=color)
 figure.colorbar(axes.pcolormesh(*edges, grid, edgecolors="white"), label="fitness of the cell's champion [m/s]")
 axes.set(xlabel="mean area ratio [1]", ylabel="share of time in contact [1]", xticks=edges[0], yticks=edges[1])
 axes.set_title(f"{len(cells)} gaits on hilly ground, from {evaluations:,} evaluations")
