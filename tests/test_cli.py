@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ import pytest
 
 from turgor.body import SIZES
 from turgor.cli import COMMANDS, main
+from turgor.evolution import STRATEGIES
 from turgor.evolution.loop import evolve
+from turgor.evolution.strategy import built_in
 from turgor.runs import Run
 from turgor.simulate import Simulator
 from turgor.task import TASKS, make_task, variant_names
@@ -84,7 +87,7 @@ def test_help_tells_every_variant_task_and_body(
         told = re.search(rf"^  --{name.replace('_', '-')} .*?(?=^  --|^$)", out, re.DOTALL | re.MULTILINE)
         assert told is not None, name
         assert "default: " in told[0]
-    for name in [*TASKS, *SIZES]:
+    for name in [*TASKS, *SIZES, *STRATEGIES]:
         assert name in out or name == "inflation"  # which evolves nothing
 
 
@@ -134,6 +137,13 @@ def test_help_imports_nothing_heavy() -> None:
         (["evolve", "--evaluations", "0"], "--evaluations: expected a whole number, at least 1; got 0"),
         (["evolve", "--threads", "0"], "--threads: expected a whole number, at least 1; got 0"),
         (["evolve", "--seed", "-1"], "seed: expected a whole number, 0 or more; got -1"),
+        (
+            ["evolve", "--strategy", "cma"],
+            "strategy: expected one of cma-es, sep-cma-es, lm-ma-es, openai-es; got 'cma'",
+        ),
+        (["evolve", "--population", "3"], "population: expected a whole number, at least 4; got 3"),
+        (["evolve", "--strategy", "openai-es", "--population", "5"], "an even whole number, at least 4; got 5"),
+        (["evolve", "--sigma", "0"], "sigma: expected a positive number; got 0.0"),
         (["evolve", "--out", "full"], "out: expected a new or empty folder; got full, which is not empty"),
         (["evolve", "--out", "full/file/run"], "Not a directory"),
         (["evaluate"], "turgor evaluate: expected RUN"),
@@ -222,6 +232,21 @@ def test_resume_evolves_further(here: Path, made: Path, capsys: pytest.CaptureFi
     assert main(["resume", "run", "--evaluations", "84", "--no-video"]) == 0
     assert Run.open(here / "run").evaluations == 84
     assert "resuming escape, small, pressure, seed 0 after 42 evaluations" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_resume_takes_the_strategy_that_the_run_was_evolved_with(
+    name: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chosen = ["--strategy", name, "--population", "8", "--sigma", "0.2"]
+    assert main(["evolve", *FAST, *chosen, "--evaluations", "16", "--no-video", "--out", "run"]) == 0
+    settings = json.loads((here / "run" / "run.json").read_text())["settings"]
+    assert (settings["strategy"], settings["population"], settings["sigma"]) == (name, 8, 0.2)
+    assert main(["resume", "run", "--evaluations", "32", "--no-video"]) == 0
+    assert f", {name} " in capsys.readouterr().out  # where the time went
+    run = Run.open(here / "run")
+    whole = evolve(run.task, 32, strategy=partial(built_in(name), population=8, sigma=0.2))
+    assert [row[:-1] for row in run.rows] == [row[:-1] for row in whole.rows]
 
 
 def test_evaluate_tells_statistics_and_writes_only_what_is_asked(

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from turgor.errors import InvalidInput
+from turgor.evolution.cma_es import CMAES
 from turgor.evolution.loop import Progress, evaluate, evolve, resume
-from turgor.evolution.strategy import CMAES, Degenerate
+from turgor.evolution.strategy import Degenerate
 from turgor.runs import Run
 from turgor.simulate import Simulator
 from turgor.task import Task, make_task
@@ -149,7 +150,7 @@ def test_state_of_another_kind_is_refused(change: dict[str, Any], text: str) -> 
 def test_bits_do_not_depend_on_the_threads_of_blas() -> None:
     code = (
         "import numpy as np, hashlib\n"
-        "from turgor.evolution.strategy import CMAES\n"
+        "from turgor.evolution.cma_es import CMAES\n"
         "s = CMAES(340, np.random.default_rng(1))\n"
         "for _ in range(12): x = s.ask(); s.tell(x, -np.square(x).sum(axis=1))\n"
         "print(hashlib.sha256(s.ask().tobytes()).hexdigest())"

@@ -20,10 +20,14 @@ if TYPE_CHECKING:
     from turgor.body import ring as ring
     from turgor.control import Sensing as Sensing
     from turgor.errors import InvalidInput as InvalidInput
+    from turgor.evolution.cma_es import CMAES as CMAES
+    from turgor.evolution.lm_ma_es import LMMAES as LMMAES
     from turgor.evolution.loop import evaluate as evaluate
     from turgor.evolution.loop import evolve as evolve
     from turgor.evolution.loop import resume as resume
-    from turgor.evolution.strategy import CMAES as CMAES
+    from turgor.evolution.openai_es import OpenAIES as OpenAIES
+    from turgor.evolution.sep_cma_es import SepCMAES as SepCMAES
+    from turgor.evolution.strategy import Degenerate as Degenerate
     from turgor.evolution.strategy import Strategy as Strategy
     from turgor.experiments.reproduce import reproduce as reproduce
     from turgor.recording import Recording as Recording
@@ -49,8 +53,12 @@ _HOME = {
     "turgor.body": ("Body", "LARGE", "MEDIUM", "SMALL", "ring"),
     "turgor.control": ("Sensing",),
     "turgor.errors": ("InvalidInput",),
+    "turgor.evolution.cma_es": ("CMAES",),
+    "turgor.evolution.lm_ma_es": ("LMMAES",),
     "turgor.evolution.loop": ("evaluate", "evolve", "resume"),
-    "turgor.evolution.strategy": ("CMAES", "Strategy"),
+    "turgor.evolution.openai_es": ("OpenAIES",),
+    "turgor.evolution.sep_cma_es": ("SepCMAES",),
+    "turgor.evolution.strategy": ("Degenerate", "Strategy"),
     "turgor.experiments.reproduce": ("reproduce",),
     "turgor.recording": ("Recording",),
     "turgor.runs": ("Run",),

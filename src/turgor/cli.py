@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import turgor
 from turgor.errors import InvalidInput
-from turgor.terminal import Parser, ProgressDisplay, add_variants, count, did_you_mean, say, whole
+from turgor.terminal import Parser, ProgressDisplay, add_variants, count, did_you_mean, number, say, whole
 
 if TYPE_CHECKING:
     from turgor.runs import Run
@@ -109,6 +110,7 @@ def _evolve_options(parser: Parser) -> None:
     )
     add("--seed", type=whole, default=0, metavar="N", help="draws the terrain and drives the evolution (default: 0)")
     _evolution_options(parser, "evaluations, at least; whole generations (default: 10000)", 10_000)
+    _strategy_options(parser)
     add(
         "--out",
         type=Path,
@@ -116,6 +118,15 @@ def _evolve_options(parser: Parser) -> None:
         help="new folder of the run (default: runs/TASK-BODY-CONDITION-sSEED, with -2, -3 ... if that exists)",
     )
     add_variants(parser)
+
+
+def _strategy_options(parser: Parser) -> None:
+    from turgor.evolution import STRATEGIES
+
+    add, names = parser.add_argument, ", ".join(STRATEGIES)
+    add("--strategy", default="cma-es", metavar="NAME", help=f"the optimizer: {names} (default: cma-es)")
+    add("--population", type=count, metavar="N", help="agents in a generation (default: 4 + floor(3 ln parameters))")
+    add("--sigma", type=number, metavar="X", help="its first step size [1] (default: 0.5; openai-es: 0.3)")
 
 
 def _resume_options(parser: Parser) -> None:
@@ -140,8 +151,11 @@ def _evolve(options: argparse.Namespace) -> None:
     variants = {name: value for name, value in chosen.items() if value is not None}
     task = make_task(options.task, body=options.body, condition=options.condition, seed=options.seed, **variants)
     from turgor.evolution.loop import evolve
+    from turgor.evolution.strategy import built_in
     from turgor.runs import check_new, free_folder
 
+    given = {name: getattr(options, name) for name in ("population", "sigma") if getattr(options, name) is not None}
+    strategy = partial(built_in(options.strategy), **given)
     out = options.out or free_folder(f"{task.name}-{options.body}-{task.condition}-s{options.seed}")
     check_new(out)
     recipe = {"name": task.name, "body": options.body, "condition": task.condition, "seed": options.seed, **variants}
@@ -152,7 +166,14 @@ def _evolve(options: argparse.Namespace) -> None:
     run = _watched(
         out,
         lambda display: evolve(
-            task, options.evaluations, options.seed, out, threads=options.threads, progress=display, recipe=recipe
+            task,
+            options.evaluations,
+            options.seed,
+            out,
+            strategy=strategy,
+            threads=options.threads,
+            progress=display,
+            recipe=recipe,
         ),
     )
     _finish(run, options)
@@ -430,6 +451,7 @@ COMMANDS = {
         "examples:\n"
         "  turgor evolve\n"
         "  turgor evolve --task escape --body large --condition springs --seed 3\n"
+        "  turgor evolve --body large --strategy sep-cma-es --population 50\n"
         "  turgor evolve --gravity 9.81 --window 15 --observation unit --out runs/variant",
         _evolve_options,
         _evolve,

@@ -46,6 +46,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     strategy: str
     population: int
     threads: int
+    sigma: float | None = None  # of the strategy at the start [1]; None: its default
     robust_repeats: int = 30
     recipe: dict[str, Any] | None = None  # arguments of `make_task`, where known
 

@@ -107,7 +107,7 @@ def evolved(task: Any, generations: int) -> tuple[Any, Any, list[Any]]:
     """The champion of a short CMA-ES run, its strategy, whose draws are the population around it, and no draws yet."""
     import numpy as np
 
-    from turgor.evolution.strategy import CMAES
+    from turgor.evolution.cma_es import CMAES
     from turgor.simulate import Simulator
 
     say(f"evolving controllers: {task.name}, {task.body.mass_count} masses, {generations} generations")

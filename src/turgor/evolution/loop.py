@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from turgor.errors import InvalidInput, describe
-from turgor.evolution.strategy import CMAES, Degenerate, Strategy
+from turgor.evolution import STRATEGIES
+from turgor.evolution.strategy import Degenerate, Strategy, built_in
 from turgor.runs import Champion, Run, Settings, current_versions
 from turgor.simulate import Rollout, Simulator, perturbed
 from turgor.task import Task
@@ -44,7 +46,7 @@ def evolve(
     seed: int = 0,
     out: str | os.PathLike[str] | None = None,
     *,
-    strategy: MakeStrategy = CMAES,
+    strategy: str | MakeStrategy = "cma-es",
     threads: int | None = None,
     progress: Callable[[Progress], object] | None = None,
     robust_repeats: int = 30,
@@ -56,13 +58,14 @@ def evolve(
     then it runs again from `robust_repeats` starts moved by 1e-6 m, of which the median is its robust fitness: the
     best of many is partly luck. An agent whose fitness is NaN counts as worse than every other.
 
-    The same `seed` gives the same bits whatever the number of `threads` (None: all cores). `strategy` makes the
-    optimizer, as in `functools.partial(CMAES, population=100)`. `progress` is called after every generation.
-    `recipe` is kept in run.json: the arguments of `make_task`. `out=None` keeps everything in memory.
+    The same `seed` gives the same bits whatever the number of `threads` (None: all cores). `strategy` is the name of
+    a built-in one, "cma-es", "sep-cma-es", "lm-ma-es" or "openai-es", or makes a `Strategy` from the number of
+    parameters and the randomness, as `functools.partial(SepCMAES, population=100)` does. `progress` is called after
+    every generation. `recipe` is kept in run.json: the arguments of `make_task`. `out=None` keeps all in memory.
 
     Ctrl-C ends it after the generation in hand, a second one at once: what was evolved is kept in `out`,
     `resume` goes on from there, and `KeyboardInterrupt` is raised. Raises `InvalidInput` for a task without anything
-    to evolve, a folder that is not empty, or where no agent of the first generation has a fitness.
+    to evolve, an unknown strategy, a folder that is not empty, or where no agent of the first generation has a fitness.
     """
     started = time.perf_counter()
     for name, value in (("evaluations", evaluations), ("robust_repeats", robust_repeats)):
@@ -72,13 +75,15 @@ def evolve(
         raise InvalidInput("seed: expected a whole number, 0 or more", describe(seed))
     if task.parameter_count == 0:
         raise InvalidInput("evolve: expected a condition that controls something", f"{task.name}, {task.condition}")
+    make = built_in(strategy) if isinstance(strategy, str) else strategy
     simulator = Simulator(task, threads=threads)
-    optimizer = strategy(task.parameter_count, np.random.default_rng(seed))
+    optimizer = make(task.parameter_count, np.random.default_rng(seed))
     settings = Settings(
         evaluations=evaluations,
         seed=seed,
         strategy=optimizer.name,
         population=optimizer.population,
+        sigma=float(optimizer.sigma),
         threads=simulator.threads,
         robust_repeats=robust_repeats,
         recipe=None if recipe is None else dict(recipe),
@@ -91,14 +96,15 @@ def resume(
     run: Run,
     evaluations: int | None = None,
     *,
-    strategy: MakeStrategy = CMAES,
+    strategy: str | MakeStrategy | None = None,
     threads: int | None = None,
     progress: Callable[[Progress], object] | None = None,
 ) -> Run:
     """`run`, taken up where it was left, to its end or to `evaluations`: with the same bits as without the pause.
 
-    It goes on from its last checkpoint; what came after is evolved again. `strategy` is what `evolve` was given.
-    Raises `InvalidInput` for a run that has no evaluations left, or whose checkpoint cannot be read.
+    It goes on from its last checkpoint; what came after is evolved again. `strategy` is what `evolve` was given; None
+    for a built-in one, which run.json names. Raises `InvalidInput` for a run that has no evaluations left, whose
+    strategy is another one or not known, or whose checkpoint cannot be read.
     """
     started = time.perf_counter()
     settings = run.settings
@@ -109,8 +115,9 @@ def resume(
         raise InvalidInput(f"evaluations: expected more than the {run.evaluations} that are done", str(budget))
     if run.status == "done" and run.note:
         raise InvalidInput(f"resume: expected a run that can go on; {run.note}")
+    make = _as_started(settings, strategy) if strategy is None or isinstance(strategy, str) else strategy
     simulator = Simulator(run.task, threads=threads)
-    optimizer = strategy(run.task.parameter_count, np.random.default_rng(settings.seed))
+    optimizer = make(run.task.parameter_count, np.random.default_rng(settings.seed))
     if optimizer.name != settings.strategy:
         raise InvalidInput(f"strategy: expected {settings.strategy}", optimizer.name)
     checkpoint = run.read_checkpoint()
@@ -123,6 +130,15 @@ def resume(
     run.write_record()
     run.go_back(checkpoint)
     return _carry_on(run, simulator, optimizer, progress, started)
+
+
+def _as_started(settings: Settings, name: str | None) -> MakeStrategy:
+    """Makes the built-in strategy as the run was started with: it may have stopped before its first checkpoint."""
+    if name is None and settings.strategy not in STRATEGIES:
+        expected = "strategy: expected the one of your own that the run was evolved with"
+        raise InvalidInput(expected, f"none, and {settings.strategy!r} is not one of {', '.join(STRATEGIES)}")
+    sigma = {} if settings.sigma is None else {"sigma": settings.sigma}
+    return partial(built_in(name or settings.strategy), population=settings.population, **sigma)
 
 
 def evaluate(simulator: Simulator, theta: ArrayLike, repeats: int = 30, size: float = 1e-6) -> Rollout:

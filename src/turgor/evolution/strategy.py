@@ -1,23 +1,25 @@
-"""Strategies: optimizers that are asked for controllers and told how good they were."""
+"""Strategies: optimizers that are asked for controllers and told how good they were.
+
+The protocol, the way from a name to a built-in strategy, and what the built-in ones share: checks of what comes from
+outside, the bits of their generator, and arithmetic that tells when numbers are lost.
+"""
 
 from __future__ import annotations
 
 import importlib
 import math
-import sys
-import warnings
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from turgor.errors import InvalidInput, describe
+from turgor.errors import InvalidInput, describe, one_of
+from turgor.evolution import STRATEGIES
 
 WORST = 1e300  # cost of an agent without a fitness: finite, so that sums stay finite
-LARGEST_CONDITION = 1e14  # of the covariance: beyond it float64 cannot tell its axes; pycma's own limit
 SMALLEST_SIGMA = 1e-150  # its square is still a number
 LARGEST_NUMBER = 1e15  # [1], of a controller: what the simulator takes
 UINT64 = 2**64
@@ -60,168 +62,12 @@ class Strategy(Protocol):
         ...
 
 
-class CMAES:
-    """CMA-ES (pycma): full covariance, active weights, cumulative step-size adaptation.
-
-        strategy = CMAES(374, np.random.default_rng(0))
-        theta = strategy.ask()
-        strategy.tell(theta, fitness)
-
-    Its initial mean is uniform in [-1, 1]. All randomness is the generator's; the bits are the same for the same
-    generator on the same machine, whatever the number of threads. It never ends by itself, apart from `Degenerate`.
-    Step sizes adapt by the length of the evolution path (CSA) for every number of parameters; pycma would take two
-    mirrored agents of each generation from 300 parameters on (TPA). The two steps that
-    take most of the time of many parameters, the covariance's update and its decomposition, are ours: the same formulas
-    on whole matrices.
-    """
-
-    name = "cma-es"
-    # What pycma's object carries from one generation to the next, with these options.
-    _OF_EVOLUTION = ("mean", "sigma", "pc", "countiter", "countevals")
-    _OF_SAMPLER = ("C", "B", "D", "last_update", "count_tell", "count_eigen")
-    _OF_STEP_SIZE = ("ps", "_ps_updated_iteration", "delta")
-
-    def __init__(
-        self,
-        parameter_count: int,
-        rng: np.random.Generator,
-        *,
-        population: int | None = None,
-        sigma: float = 0.5,
-        mean: ArrayLike | None = None,
-    ) -> None:
-        """`population`: None for 4 + floor(3 ln parameter_count); `mean` [parameter]: None for uniform in [-1, 1].
-
-        Raises `InvalidInput`.
-        """
-        if parameter_count < 1:
-            raise InvalidInput("evolve: expected a task with something to evolve", "a controller without parameters")
-        population = default_population(parameter_count) if population is None else population
-        if not isinstance(population, int) or population < 4:
-            raise InvalidInput("population: expected a whole number, at least 4", describe(population))
-        if not (math.isfinite(sigma) and sigma > 0):
-            raise InvalidInput("sigma: expected a positive number", describe(sigma))
-        if not isinstance(rng.bit_generator, np.random.PCG64):
-            kind = type(rng.bit_generator).__name__
-            raise InvalidInput("rng: expected a generator on PCG64 (numpy.random.default_rng)", kind)
-        mean = rng.uniform(-1, 1, parameter_count) if mean is None else np.array(mean, dtype=np.float64)
-        if mean.shape != (parameter_count,) or not np.isfinite(mean).all():
-            raise InvalidInput(f"mean: expected {parameter_count} finite numbers", f"shape {list(mean.shape)}")
-        self._rng = rng
-        self._start(mean, float(sigma), population)
-
-    @property
-    def population(self) -> int:
-        return self._evolution.popsize
-
-    @property
-    def sigma(self) -> float:
-        return float(self._evolution.sigma)
-
-    def ask(self) -> np.ndarray:
-        """The next generation, float64 [agent, parameter]."""
-        self._before_ask = _bits(self._rng)
-        with _numerics():
-            theta = np.array(self._evolution.ask())
-        self._check(theta)
-        return theta
-
-    def tell(self, theta: np.ndarray, fitness: np.ndarray) -> None:
-        """Learns from the `fitness` [agent], the higher the better, of `theta` from `ask`. Only its order counts; NaN
-        and -inf are worse than every number."""
-        cost = np.nan_to_num(-np.asarray(fitness, dtype=np.float64), nan=WORST, posinf=WORST, neginf=-WORST)
-        with _numerics():
-            self._evolution.tell(list(theta), np.clip(cost, -WORST, WORST).tolist())
-        self._before_ask = _bits(self._rng)
-        self._check(self._evolution.mean)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Arrays from which `restore` goes on; taken between `ask` and `tell`, it goes on with the same `ask`."""
-        evolution = self._evolution
-        parts = (
-            (evolution, self._OF_EVOLUTION),
-            (evolution.sm, self._OF_SAMPLER),
-            (evolution.adapt_sigma, self._OF_STEP_SIZE),
-        )
-        # order "K": the order of B in memory decides which of BLAS's routines multiplies it
-        arrays = {name: np.array(getattr(part, name), order="K") for part, names in parts for name in names}
-        return {**arrays, "population": np.array(self.population), "generator": self._before_ask.copy()}
-
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Goes on from `state`; number of parameters and population are the state's. Raises `InvalidInput`."""
-        names = (*self._OF_EVOLUTION, *self._OF_SAMPLER, *self._OF_STEP_SIZE, "population", "generator")
-        missing = [name for name in names if name not in state]
-        if missing:
-            raise InvalidInput(f"state of {self.name}: expected {', '.join(names)}", f"no {', '.join(missing)}")
-        n = np.size(state["mean"])
-        shapes = {"mean": (n,), "pc": (n,), "ps": (n,), "D": (n,), "B": (n, n), "C": (n, n), "generator": (6,)}
-        for name in names:
-            value, shape = state[name], shapes.get(name, ())
-            if np.shape(value) != shape or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
-                raise InvalidInput(f"state of {self.name}: expected finite numbers of shape {list(shape)} in {name}")
-        self._start(np.array(state["mean"]), float(state["sigma"]), int(state["population"]))
-        evolution = self._evolution
-        _put(evolution, state, self._OF_EVOLUTION)
-        _put(evolution.sm, state, self._OF_SAMPLER)
-        _put(evolution.adapt_sigma, state, self._OF_STEP_SIZE)
-        evolution._updateBDfromSM()
-        self._before_ask = np.array(state["generator"], dtype=np.uint64)
-        _set_bits(self._rng, self._before_ask)
-
-    def _start(self, mean: np.ndarray, sigma: float, population: int) -> None:
-        cma = _load_pycma()
-        options = {
-            "randn": lambda *shape: self._rng.standard_normal(shape),
-            "seed": math.nan,  # any other seeds NumPy's global generator
-            "popsize": population,
-            "AdaptSigma": cma.sigma_adaptation.CMAAdaptSigmaCSA,
-            # else pycma changes its coordinates on the way, and with them what its state means
-            "conditioncov_alleviate": False,
-            "CMA_mirrors": 0,  # else small populations carry directions from one generation to the next
-            "verbose": -10,
-            "verb_log": 0,
-            "verb_disp": 0,
-        }
-        self._evolution: Any = cma.CMAEvolutionStrategy(mean, sigma, options)
-        self._evolution.mean_old = self._evolution.mean  # `tell` sets it, but asks for it from the second time on
-        self._evolution.sm.eigenmethod = _decompose
-        self._evolution.sm.update = partial(_learn, self._evolution.sm)
-        self._evolution.timer = cma.utilities.utils.ElapsedWCTime()  # `ask` makes it in the first generation alone
-        self._before_ask = _bits(self._rng)
-
-    def _check(self, numbers: np.ndarray) -> None:
-        evolution = self._evolution
-        sound = np.isfinite(evolution.sm.C).all() and SMALLEST_SIGMA < evolution.sigma < np.inf
-        if not (sound and (np.abs(numbers) <= LARGEST_NUMBER).all()):
-            raise Degenerate("its mean, step size or covariance is no longer a finite number, or too large or small")
-        condition = float(evolution.sm.D[-1] / evolution.sm.D[0]) ** 2
-        if condition > LARGEST_CONDITION:
-            raise Degenerate(f"its covariance's condition number is {condition:.0e}, too large for float64")
-
-
-def _learn(sampler: Any, vectors: Any, weights: Any, c1_times_delta_hsigma: float = 0.0) -> None:
-    """C <- (1 + delta - sum w) C + sum_k w_k y_k y_k', with  w_k N / |C^(-1/2) y_k|^2  in place of a negative w_k
-    (Hansen, "The CMA Evolution Strategy: A Tutorial", 2016, equations 46 and 47).
-
-    pycma's `update` takes the norms one by one, and C three times through memory.
-    """
-    from scipy.linalg import get_blas_funcs
-
-    y, w = np.asarray(vectors), np.array(weights)
-    decay = 1 + c1_times_delta_hsigma - w.sum()
-    worse = w < 0
-    norm = np.sqrt((((y[worse] @ sampler.B) / sampler.D) ** 2).sum(axis=1))
-    w[worse] *= y.shape[1] / (norm + 1e-9) ** 2
-    gemm = get_blas_funcs("gemm", dtype=np.float64)
-    sampler.C = gemm(1.0, (w[:, None] * y).T, y.T, beta=decay, c=sampler.C.T, trans_b=True, overwrite_c=True).T
-    sampler.count_tell += 1
-
-
-def _decompose(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and eigenvectors, by divide and conquer: a tenth faster than NumPy's call of the same routine."""
-    from scipy.linalg import eigh
-
-    return eigh(covariance, driver="evd", check_finite=False)
+def built_in(name: str) -> Callable[..., Strategy]:
+    """The class of a built-in strategy by its name, one of `STRATEGIES`. Raises `InvalidInput`."""
+    if name not in STRATEGIES:
+        raise one_of("strategy", STRATEGIES, name)
+    module, kind = STRATEGIES[name]
+    return getattr(importlib.import_module(module), kind)
 
 
 def default_population(parameter_count: int) -> int:
@@ -229,14 +75,82 @@ def default_population(parameter_count: int) -> int:
     return 4 + math.floor(3 * math.log(parameter_count))
 
 
-def _put(part: Any, state: dict[str, np.ndarray], names: tuple[str, ...]) -> None:
-    """Sets fields: arrays as copies in the same order in memory, single numbers as Python's own."""
-    for name in names:
-        value = state[name]
-        setattr(part, name, np.array(value, order="K") if np.ndim(value) else value.item())
+# --- what comes from outside --------------------------------------------------------------------------------------
 
 
-def _bits(rng: np.random.Generator) -> np.ndarray:
+def check_start(
+    parameter_count: int,
+    rng: np.random.Generator,
+    population: int | None,
+    sigma: float,
+    mean: ArrayLike | None,
+    *,
+    even: bool = False,
+) -> tuple[int, float, np.ndarray]:
+    """Population, step size and mean [parameter] to start from; the mean is uniform in [-1, 1] where it is None, the
+    population `default_population`, and one more where it has to be `even`. Raises `InvalidInput`."""
+    if parameter_count < 1:
+        raise InvalidInput("evolve: expected a task with something to evolve", "a controller without parameters")
+    if population is None:
+        population = default_population(parameter_count)
+        population += population % 2 if even else 0
+    if not isinstance(population, int) or population < 4 or (even and population % 2):
+        kind = "an even whole number" if even else "a whole number"
+        raise InvalidInput(f"population: expected {kind}, at least 4", describe(population))
+    check_positive("sigma", sigma)
+    if not isinstance(rng.bit_generator, np.random.PCG64):
+        kind = type(rng.bit_generator).__name__
+        raise InvalidInput("rng: expected a generator on PCG64 (numpy.random.default_rng)", kind)
+    start = rng.uniform(-1, 1, parameter_count) if mean is None else np.array(mean, dtype=np.float64)
+    if start.shape != (parameter_count,) or not np.isfinite(start).all():
+        raise InvalidInput(f"mean: expected {parameter_count} finite numbers", f"shape {list(start.shape)}")
+    return population, float(sigma), start
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raises `InvalidInput` unless `value` is a positive, finite number."""
+    if not (math.isfinite(value) and value > 0):
+        raise InvalidInput(f"{name}: expected a positive number", describe(value))
+
+
+def check_told(theta: np.ndarray, fitness: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """`theta` as float64 [agent, parameter] and the cost [agent] of each: the negative fitness, all of it finite.
+
+    Raises `InvalidInput` unless they are of the `shape` that was asked.
+    """
+    theta, fitness = np.asarray(theta, dtype=np.float64), np.asarray(fitness, dtype=np.float64)
+    if theta.shape != shape or not np.isfinite(theta).all():
+        raise InvalidInput(f"theta: expected finite numbers of shape {list(shape)}", f"shape {list(theta.shape)}")
+    if fitness.shape != shape[:1]:
+        raise InvalidInput(f"fitness: expected numbers of shape {list(shape[:1])}", f"shape {list(fitness.shape)}")
+    cost = np.nan_to_num(-fitness, nan=WORST, posinf=WORST, neginf=-WORST)
+    return theta, np.clip(cost, -WORST, WORST)
+
+
+def check_state(name: str, state: Mapping[str, np.ndarray], shapes: Mapping[str, str]) -> None:
+    """Raises `InvalidInput` unless `state` holds a generator and finite numbers of the given `shapes`, in which a
+    letter stands for a length, as in {"mean": "n", "C": "nn", "sigma": ""}."""
+    shapes = {**shapes, "generator": "6"}
+    missing = [key for key in shapes if key not in state]
+    if missing:
+        raise InvalidInput(f"state of {name}: expected {', '.join(shapes)}", f"no {', '.join(missing)}")
+    lengths = {"6": 6}
+    for key, letters in shapes.items():
+        value = np.asarray(state[key])
+        for letter, length in zip(letters, value.shape, strict=False):
+            lengths.setdefault(letter, length)
+        shape = tuple(lengths.get(letter, 0) for letter in letters)
+        kinds = "u" if key == "generator" else "iuf"
+        if value.shape != shape or value.dtype.kind not in kinds or not np.isfinite(value).all():
+            raise InvalidInput(f"state of {name}: expected finite numbers of shape {list(shape)} in {key}")
+    if not (state["sigma"] > 0 and state["population"] >= 4 and int(state["population"]) == state["population"]):
+        raise InvalidInput(f"state of {name}: expected a positive sigma and a population of at least 4")
+
+
+# --- randomness ---------------------------------------------------------------------------------------------------
+
+
+def rng_bits(rng: np.random.Generator) -> np.ndarray:
     """The state of a PCG64 generator, uint64 [6]: state, increment (high, low), whether half a draw is left, it."""
     bits: Any = rng.bit_generator.state
     state, inc = bits["state"]["state"], bits["state"]["inc"]
@@ -244,7 +158,8 @@ def _bits(rng: np.random.Generator) -> np.ndarray:
     return np.array(numbers, dtype=np.uint64)
 
 
-def _set_bits(rng: np.random.Generator, bits: np.ndarray) -> None:
+def set_rng_bits(rng: np.random.Generator, bits: np.ndarray) -> None:
+    """Sets a PCG64 generator to what `rng_bits` returned."""
     state_high, state_low, inc_high, inc_low, left, half = (int(b) for b in bits)
     rng.bit_generator.state = {
         "bit_generator": "PCG64",
@@ -252,6 +167,20 @@ def _set_bits(rng: np.random.Generator, bits: np.ndarray) -> None:
         "has_uint32": left,
         "uinteger": half,
     }
+
+
+# --- arithmetic ---------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def numerics() -> Generator[None]:
+    """One thread for BLAS (its results depend on their number, and here more of them are slower); what the arithmetic
+    stumbles over becomes `Degenerate`."""
+    try:
+        with _blas().limit(limits=1), np.errstate(over="raise", divide="raise", invalid="raise"):
+            yield
+    except (ArithmeticError, AssertionError, RecursionError, np.linalg.LinAlgError) as error:
+        raise Degenerate(f"its numbers broke down ({type(error).__name__} {error})".replace(" )", ")")) from error
 
 
 @cache
@@ -262,30 +191,8 @@ def _blas() -> Any:
     return ThreadpoolController().select(user_api="blas")
 
 
-@contextmanager
-def _numerics() -> Generator[None]:
-    """One thread for BLAS (its results depend on their number, and here more of them are slower); what pycma stumbles
-    over becomes `Degenerate`."""
-    try:
-        with _blas().limit(limits=1), np.errstate(over="raise", divide="raise", invalid="raise"):
-            yield
-    except (ArithmeticError, AssertionError, RecursionError, np.linalg.LinAlgError) as error:
-        raise Degenerate(f"its numbers broke down ({type(error).__name__} {error})".replace(" )", ")")) from error
-
-
-@cache
-def _load_pycma() -> Any:
-    """pycma, without the plots and the tests of ranks that it loads but that nothing here uses.
-
-    They would take 3.4 of 4 seconds. Modules that are loaded already stay as they are.
-    """
-    unused = ("matplotlib", "matplotlib.pyplot", "scipy", "scipy.stats")
-    left_out = [name for name in unused if name not in sys.modules and "cma" not in sys.modules]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        sys.modules.update(dict.fromkeys(left_out))  # ty: ignore[no-matching-overload]
-        try:
-            return importlib.import_module("cma")
-        finally:
-            for name in left_out:
-                del sys.modules[name]
+def check_numbers(sigma: float, numbers: np.ndarray, covariance: np.ndarray | None = None) -> None:
+    """Raises `Degenerate` unless the step size, a mean or theta, and the covariance are numbers that can be used."""
+    sound = SMALLEST_SIGMA < sigma < np.inf and (np.abs(numbers) <= LARGEST_NUMBER).all()
+    if not (sound and (covariance is None or np.isfinite(covariance).all())):
+        raise Degenerate("its mean, step size or covariance is no longer a finite number, or too large or small")

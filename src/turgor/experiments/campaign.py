@@ -23,9 +23,9 @@ from typing import Any
 import msgspec
 
 from turgor.errors import InvalidInput, describe
+from turgor.evolution.cma_es import CMAES
 from turgor.evolution.loop import Progress as RunProgress
 from turgor.evolution.loop import evolve, resume
-from turgor.evolution.strategy import CMAES
 from turgor.experiments.measure import Measured, measure
 from turgor.experiments.plan import Entry
 from turgor.runs import Run
