@@ -16,9 +16,8 @@ import pytest
 from numba import njit
 
 from turgor.body import Body, ring
-from turgor.control import rows
 from turgor.physics import reference
-from turgor.physics.actuate import tanh
+from turgor.physics.control import tanh
 from turgor.physics.memory import Floats, Width, aligned, field_of, layout, views
 from turgor.physics.model import COMMANDS, CONTROLLER, WIDTH, Model, State
 from turgor.physics.tables import make_kernel
@@ -42,7 +41,7 @@ class Engine:
         starts = np.repeat(task.position[None], len(theta), axis=0) if position is None else position
         self.kernel = make_kernel(msgspec.structs.replace(task, end=None))
         self.batch = _Batch(self.kernel, starts.astype(np.float32))
-        self.batch.think(*rows(theta, task.body, task.condition))
+        self.batch.think(theta, task)
         self.batch.run(CONTROLLER, first=0, steps=0, last=NEVER)
         self._seen: dict[Any, np.ndarray] = {}
 

@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from turgor.body import SMALL as SMALL
     from turgor.body import Body as Body
     from turgor.body import ring as ring
+    from turgor.control import MLP as MLP
+    from turgor.control import Distributed as Distributed
+    from turgor.control import Linear as Linear
     from turgor.control import Sensing as Sensing
+    from turgor.control import Sinusoid as Sinusoid
     from turgor.errors import InvalidInput as InvalidInput
     from turgor.evolution.loop import evaluate as evaluate
     from turgor.evolution.loop import evolve as evolve
@@ -45,7 +49,7 @@ if TYPE_CHECKING:
 # `import turgor` and the command line answer at once.
 _HOME = {
     "turgor.body": ("Body", "LARGE", "MEDIUM", "SMALL", "ring"),
-    "turgor.control": ("Sensing",),
+    "turgor.control": ("Distributed", "Linear", "MLP", "Sensing", "Sinusoid"),
     "turgor.errors": ("InvalidInput",),
     "turgor.evolution.loop": ("evaluate", "evolve", "resume"),
     "turgor.evolution.strategy": ("CMAES", "Strategy"),

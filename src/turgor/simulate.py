@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from turgor import physics
 from turgor.body import Body
-from turgor.control import check_theta, observation_count, output_count, rows
+from turgor.control import check_theta, observation_count, output_count, pack
 from turgor.errors import InvalidInput, describe
 from turgor.physics.memory import LINE, Width, aligned
 from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH, Brain, Result, State, Work
@@ -68,7 +68,7 @@ class Simulator:
     def rollout(self, theta: ArrayLike, position: ArrayLike | None = None) -> Rollout:
         """A `Rollout` of every row of `theta` [agent, parameter] from the task's start, or from `position` [m],
         shape [agent, mass, 2]. Raises `InvalidInput` for another shape or numbers that are not finite."""
-        theta = check_theta(theta, self.task.body, self.task.condition)
+        theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
         starts = self._starts(len(theta), position)
         final = np.empty(starts.shape, dtype=np.float32)
         steps = np.empty(len(theta), dtype=np.int64)
@@ -76,7 +76,7 @@ class Simulator:
 
         def run(part: slice) -> None:
             batch = _Batch(self._kernel, starts[part])
-            batch.think(*rows(theta[part], self.task.body, self.task.condition))
+            batch.think(theta[part], self.task)
             final[part], steps[part], solved[part] = self._run_whole(batch)
 
         self._spread(run, _parts(len(theta), self.threads))
@@ -85,10 +85,11 @@ class Simulator:
     def record(self, theta: ArrayLike, position: ArrayLike | None = None) -> Recording:
         """The `Recording` of one controller, `theta` [parameter], from the task's start or from `position`
         [mass, 2]: the same steps that `rollout` takes."""
-        theta = check_theta(np.reshape(np.asarray(theta), (1, -1)), self.task.body, self.task.condition)
+        theta = np.reshape(np.asarray(theta), (1, -1))
+        theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
         starts = self._starts(1, None if position is None else np.asarray(position)[None])
         batch = _Batch(self._kernel, starts)
-        batch.think(*rows(theta, self.task.body, self.task.condition))
+        batch.think(theta, self.task)
         trace = batch.trace(self.task.steps)
         final, steps, solved = self._run_whole(batch, trace)
         out = self._judge(starts, final, steps, solved)
@@ -268,11 +269,12 @@ class _Batch:
         self.results = aligned(blocks, kernel.size(Result))
         self._step = 0
 
-    def think(self, weights: np.ndarray, biases: np.ndarray) -> None:
-        """Gives the agents their controllers: weights [agent, output, input], biases [agent, output]."""
+    def think(self, theta: np.ndarray, task: Task) -> None:
+        """Gives the agents their controllers, `theta` [agent, parameter]."""
+        weights, biases = pack(theta, task.body, task.condition, task.controller, task.physics.dt)
         for block, brain in enumerate(self.brains):
             lanes = self.lanes[block * WIDTH : (block + 1) * WIDTH]
-            self.kernel.field(brain, Brain, "weight")[:] = weights[lanes].reshape(WIDTH, -1).T
+            self.kernel.field(brain, Brain, "weight")[:] = weights[lanes].T
             self.kernel.field(brain, Brain, "bias")[:] = biases[lanes].T
 
     def trace(self, steps: int) -> np.ndarray:

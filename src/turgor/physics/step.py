@@ -4,8 +4,9 @@ from functools import partial
 
 from numba import njit
 
-from turgor.physics.actuate import actuate, control, take_commands, take_lengths
+from turgor.physics.actuate import actuate, take_commands, take_lengths
 from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, note_travel
+from turgor.physics.control import control
 from turgor.physics.lanes import any_lane, rare, select, stage
 from turgor.physics.memory import lane_count, views
 from turgor.physics.model import (
@@ -30,7 +31,7 @@ from turgor.physics.springs import prepare_springs
 def step(settings, model, state, work, brain, script, drive, t, row):
     """Step t (from 0) of a block. It starts from an observation and ends with the one that the next step needs."""
     if drive == CONTROLLER:
-        control(settings, brain, work)
+        control(settings, model, state, work, brain)
         actuate(settings, model, state, work)
     elif drive == COMMANDS:
         take_commands(settings, work, script, row)
@@ -79,6 +80,8 @@ def begin(settings, model, state, work, result, position, velocity, first, width
         state.window[k] = 0.0
     for k in range(settings.inputs):
         state.total[k] = 0.0
+    for k in range(settings.memory):
+        state.memory[k] = 0.0
     for slot in range(settings.masses * settings.slots):
         state.ground_live[slot] = 0
         for lane in range(lane_count(width)):
