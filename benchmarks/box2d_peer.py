@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from turgor.control import rows
+from turgor.control import Linear, rows
 from turgor.task import Physics, Task, make_task
 
 with warnings.catch_warnings():
@@ -143,6 +143,8 @@ def check_task(task: Task) -> None:
     fixed = {name: getattr(Physics(), name) for name in Physics.__struct_fields__ if name not in alike}
     if any(getattr(task.physics, name) != value for name, value in fixed.items()):
         raise ValueError("expected the `paper` preset: Box2D's own numbers cannot be changed")
+    if task.controller != Linear():
+        raise ValueError("expected a linear controller")
     if task.condition != "pressure" or task.body.chamber_count != 1 or task.end is not None:
         raise ValueError("expected one chamber under control, and a task without an end")
     if len(task.body.chambers[0]) != task.body.mass_count or task.sensing.observation != "signed":

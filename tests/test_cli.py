@@ -20,6 +20,7 @@ import pytest
 
 from turgor.body import SIZES
 from turgor.cli import COMMANDS, main
+from turgor.control import Distributed
 from turgor.evolution import STRATEGIES
 from turgor.evolution.loop import evolve
 from turgor.evolution.strategy import built_in
@@ -132,6 +133,16 @@ def test_help_imports_nothing_heavy() -> None:
         (["evolve", "--condition", "none"], "condition: expected one of pressure, springs, passive; got 'none'"),
         (["evolve", "--condition", "passive"], "expected a condition that controls something; got hilly, passive"),
         (["evolve", "--task", "inflation"], "expected a condition that controls something; got inflation, passive"),
+        (
+            ["evolve", "--controller", "pid"],
+            "controller: expected one of linear, mlp, sinusoid, distributed; got 'pid'",
+        ),
+        (["evolve", "--hidden", "4"], "hidden: expected a controller that has it (mlp, distributed); got linear"),
+        (
+            ["evolve", "--controller", "mlp", "--messages", "2"],
+            "expected a controller that has it (distributed); got mlp",
+        ),
+        (["evolve", "--controller", "mlp", "--hidden", "0"], "hidden: expected a whole number, 1 to 1000; got 0"),
         (["evolve", "--radius", "-1"], "radius: expected a positive number of metres; got -1.0"),
         (["evolve", "--mass-count", "2"], "mass_count: expected a whole number, at least 3; got 2"),
         (["evolve", "--evaluations", "0"], "--evaluations: expected a whole number, at least 1; got 0"),
@@ -225,6 +236,17 @@ def test_threads_do_not_change_a_bit(here: Path) -> None:
     )
     assert one == two
     assert (here / "1" / "champion.npz").read_bytes() == (here / "2" / "champion.npz").read_bytes()
+
+
+def test_evolve_takes_a_controller(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["evolve", *FAST, "--evaluations", "21", "--no-video", "--controller", "distributed", "--hidden", "3"]
+    assert main(argv) == 0
+    run = Run.open(here / "runs" / "flat-small-pressure-distributed-s0")
+    expected = make_task("flat", steps=40, controller=Distributed(hidden=3))
+    assert run.task.identity == expected.identity
+    assert run.settings.recipe is not None
+    assert make_task(**run.settings.recipe).identity == expected.identity
+    assert "evolving flat, small, pressure, distributed, seed 0: 40 parameters" in capsys.readouterr().out
 
 
 def test_resume_evolves_further(here: Path, made: Path, capsys: pytest.CaptureFixture[str]) -> None:

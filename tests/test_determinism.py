@@ -39,6 +39,10 @@ TASKS = {
     "escape-authors": make_task("escape-authors", body="medium", steps=STEPS),
     "inflation": make_task("inflation", steps=STEPS, rest_steps=200),
     "inflation-large": make_task("inflation", body="large", steps=STEPS, rest_steps=200),
+    "mlp": make_task("hilly", controller="mlp", steps=STEPS),
+    "sinusoid": make_task("hilly", controller="sinusoid", steps=STEPS),
+    "distributed": make_task("hilly", controller="distributed", steps=STEPS),
+    "distributed-large": make_task("escape", body="large", condition="springs", controller="distributed", steps=STEPS),
     # ends while others are under way
     "leaving": msgspec.structs.replace(make_task("flat", steps=STEPS), end=Leave(half_width=0.5), fitness="elapsed"),
 }
@@ -129,7 +133,7 @@ def test_the_default_start_is_the_tasks(name: str) -> None:
             assert getattr(usual, field).tobytes() == getattr(other, field).tobytes(), field
 
 
-@pytest.mark.parametrize("name", ["hilly", "escape-large", "leaving"])
+@pytest.mark.parametrize("name", ["hilly", "escape-large", "leaving", "sinusoid", "distributed"])
 def test_a_recording_has_the_bits_of_the_rollout(name: str) -> None:
     theta, position = agents(name)
     for agent in (0, 1, 3):
@@ -156,10 +160,11 @@ def test_stepping_does_not_depend_on_batch_or_threads(threads: int) -> None:
 
 
 def digest() -> str:
-    """Of what 20 agents do in 600 steps on three tasks."""
+    """Of what 20 agents do in 600 steps on five tasks."""
     found = hashlib.sha256()
-    for name, body in (("hilly", "small"), ("escape", "medium"), ("hilly", "large")):
-        task = make_task(name, body=body, steps=600)
+    linear = [("hilly", "small", "linear"), ("escape", "medium", "linear"), ("hilly", "large", "linear")]
+    for name, body, controller in [*linear, ("hilly", "small", "sinusoid"), ("hilly", "medium", "distributed")]:
+        task = make_task(name, body=body, controller=controller, steps=600)
         theta = np.random.default_rng(5).uniform(-1, 1, (20, task.parameter_count))
         theta[::3] *= 10
         found.update(Simulator(task, threads=1).rollout(theta).position.tobytes())

@@ -14,11 +14,11 @@ import turgor
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCKS = [
-    pytest.param(code, id=f"{page.stem}-{number}")
+# the python blocks of a page are one program
+PROGRAMS = {
+    page.stem: "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL))
     for page in PAGES
-    for number, code in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL))
-]
+}
 NEEDS = ("cmaes", "ribs", "stable_baselines3")  # packages of examples, which turgor itself does without
 SHORT = {"train_ppo": ["--steps", "64", "--agents", "2"]}  # options that make an example short
 
@@ -56,14 +56,15 @@ def test_example_with_ribs_maps_gaits_and_saves_them_by_name(tmp_path: Path) -> 
     assert (tmp_path / "gaits.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("code", BLOCKS)
-def test_page_shows_what_works(code: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("page", [page for page, code in PROGRAMS.items() if code])
+def test_page_shows_what_works(page: str, tmp_path: Path) -> None:
+    code = PROGRAMS[page]
     skip_without_its_packages(code)
     subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=tmp_path, check=True, timeout=300)
 
 
 def test_pages_name_what_exists() -> None:
-    assert BLOCKS
+    assert PROGRAMS["README"]
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         for command in sorted(set(re.findall(r"turgor (evolve|evaluate|video|bench|resume|reproduce)\b", text))):

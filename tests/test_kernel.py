@@ -16,10 +16,10 @@ import pytest
 from numba import njit
 
 from turgor.body import Body, ring
-from turgor.control import rows
+from turgor.control import Distributed, Sinusoid
 from turgor.physics import reference
-from turgor.physics.actuate import tanh
 from turgor.physics.batch import Batch, World
+from turgor.physics.control import tanh
 from turgor.physics.memory import Floats, Width, aligned, field_of, layout, views
 from turgor.physics.model import COMMANDS, CONTROLLER, WIDTH, Model, State
 from turgor.scene import GROUND_DEPTH, Scene
@@ -42,7 +42,7 @@ class Engine:
         starts = np.repeat(task.position[None], len(theta), axis=0) if position is None else position
         self.batch = Batch(World(msgspec.structs.replace(task, end=None)), starts)
         self.kernel = self.batch.kernel
-        self.batch.think(*rows(theta, task.body, task.condition))
+        self.batch.think(theta)
         self.batch.begin()
         self._seen: dict[Any, np.ndarray] = {}
 
@@ -104,7 +104,16 @@ class Engine:
             spring_impulse=self.spring_impulse(agent),
             contacts=self.impulses(agent),
             window=deque([past[k % window].astype(np.float64) for k in kept], maxlen=window),
+            **self.memory(agent),
         )
+
+    def memory(self, agent: int) -> dict[str, Any]:
+        """What the agent's controller keeps."""
+        memory = self.state("memory", agent).astype(np.float64)
+        if isinstance(self.task.controller, Sinusoid):
+            return {"phase": memory[0]}
+        messages = getattr(self.task.controller, "messages", 0)
+        return {"messages": memory.reshape(self.task.body.spring_count, 2, messages)}
 
 
 def controllers(task: Task, agents: int, seed: int, scale: float = 1.0) -> np.ndarray:
@@ -163,6 +172,15 @@ STATES: dict[str, tuple[tuple[int, ...], float, dict[str, Any]]] = {
     "cage-springs": ((300,), 3, {"name": "escape-authors", "body": "medium", "condition": "springs"}),
     "cage-collapsed": ((150, 300), 3, {"name": "escape", "body": "medium", "pressure_max": 0.2}),
     "unit": ((40,), 1, {"observation": "unit", "window": 7, "pressure_unit": 500.0, "gravity": 3.7}),
+    "mlp": ((1, 200, 900), 1, {"controller": "mlp"}),
+    "mlp-springs": ((150, 700), 3, {"controller": "mlp", "body": "large", "condition": "springs"}),
+    "sinusoid": ((1, 2, 300, 1000), 1, {"controller": "sinusoid"}),
+    "sinusoid-large": ((100, 600), 1, {"controller": "sinusoid", "body": "large", "condition": "springs"}),
+    "distributed": ((1, 2, 100, 300, 1000), 1, {"controller": "distributed"}),
+    "distributed-medium": ((50, 300), 3, {"controller": "distributed", "body": "medium", "name": "escape"}),
+    "distributed-large": ((50, 300), 2, {"controller": "distributed", "body": "large", "condition": "springs"}),
+    "distributed-talking": ((60, 300), 1, {"controller": Distributed(hidden=5, messages=3), "observation": "unit"}),
+    "distributed-silent": ((60, 300), 1, {"controller": Distributed(hidden=1, messages=0)}),
     "commanded": ((60, 300), 1, {"body": "medium", "pressure_length": "commanded"}),
 }
 AGENTS = 6
@@ -223,6 +241,8 @@ def moved(state: reference.State, rng: np.random.Generator) -> reference.State:
         spring_impulse=state.spring_impulse.copy(),
         contacts=dict(state.contacts),
         window=deque(state.window, maxlen=state.window.maxlen),
+        phase=state.phase,
+        messages=state.messages,
     )
 
 

@@ -18,7 +18,11 @@ if TYPE_CHECKING:
     from turgor.body import SMALL as SMALL
     from turgor.body import Body as Body
     from turgor.body import ring as ring
+    from turgor.control import MLP as MLP
+    from turgor.control import Distributed as Distributed
+    from turgor.control import Linear as Linear
     from turgor.control import Sensing as Sensing
+    from turgor.control import Sinusoid as Sinusoid
     from turgor.errors import InvalidInput as InvalidInput
     from turgor.evolution.cma_es import CMAES as CMAES
     from turgor.evolution.lm_ma_es import LMMAES as LMMAES
@@ -51,7 +55,7 @@ if TYPE_CHECKING:
 # `import turgor` and the command line answer at once.
 _HOME = {
     "turgor.body": ("Body", "LARGE", "MEDIUM", "SMALL", "ring"),
-    "turgor.control": ("Sensing",),
+    "turgor.control": ("Distributed", "Linear", "MLP", "Sensing", "Sinusoid"),
     "turgor.errors": ("InvalidInput",),
     "turgor.evolution.cma_es": ("CMAES",),
     "turgor.evolution.lm_ma_es": ("LMMAES",),

@@ -108,6 +108,15 @@ def _evolve_options(parser: Parser) -> None:
         metavar="NAME",
         help="what is controlled: pressure (springs and pressure) or springs (default: pressure)",
     )
+    add(
+        "--controller",
+        default="linear",
+        metavar="NAME",
+        help="linear (the paper's), mlp (a hidden layer), sinusoid (open loop) or distributed (the same small "
+        "network in every mass) (default: linear)",
+    )
+    add("--hidden", type=int, metavar="N", help="units of the hidden layer (default: mlp 16, distributed 8)")
+    add("--messages", type=int, metavar="N", help="numbers sent each way along a spring (default: distributed 1)")
     add("--seed", type=whole, default=0, metavar="N", help="draws the terrain and drives the evolution (default: 0)")
     _evolution_options(parser, "evaluations, at least; whole generations (default: 10000)", 10_000)
     _strategy_options(parser)
@@ -115,7 +124,8 @@ def _evolve_options(parser: Parser) -> None:
         "--out",
         type=Path,
         metavar="FOLDER",
-        help="new folder of the run (default: runs/TASK-BODY-CONDITION-sSEED, with -2, -3 ... if that exists)",
+        help="new folder of the run (default: runs/TASK-BODY-CONDITION-sSEED, with the controller's name before the "
+        "seed if it is not linear, with -2, -3 ... if that exists)",
     )
     add_variants(parser)
 
@@ -145,10 +155,14 @@ def _threads_option(parser: Parser) -> None:
 
 
 def _evolve(options: argparse.Namespace) -> None:
+    from turgor.control import Linear, make_controller
     from turgor.task import make_task, variant_names
 
     chosen = {name: getattr(options, name) for name in variant_names()}
     variants = {name: value for name, value in chosen.items() if value is not None}
+    controller = make_controller(options.controller, hidden=options.hidden, messages=options.messages)
+    if controller != Linear():
+        variants["controller"] = controller
     task = make_task(options.task, body=options.body, condition=options.condition, seed=options.seed, **variants)
     from turgor.evolution.loop import evolve
     from turgor.evolution.strategy import built_in
@@ -156,7 +170,7 @@ def _evolve(options: argparse.Namespace) -> None:
 
     given = {name: getattr(options, name) for name in ("population", "sigma") if getattr(options, name) is not None}
     strategy = partial(built_in(options.strategy), **given)
-    out = options.out or free_folder(f"{task.name}-{options.body}-{task.condition}-s{options.seed}")
+    out = options.out or free_folder("-".join([task.name, options.body, *_controlled(task), f"s{options.seed}"]))
     check_new(out)
     recipe = {"name": task.name, "body": options.body, "condition": task.condition, "seed": options.seed, **variants}
     say(
@@ -426,7 +440,15 @@ def _bench(options: argparse.Namespace) -> int:
 
 def _name(task: Task, recipe: dict[str, Any] | None) -> str:
     parts = [task.name, str(recipe["body"])] if recipe else [task.name]
-    return ", ".join([*parts, task.condition, *([f"seed {recipe['seed']}"] if recipe else [])])
+    return ", ".join([*parts, *_controlled(task), *([f"seed {recipe['seed']}"] if recipe else [])])
+
+
+def _controlled(task: Task) -> list[str]:
+    """The condition, and the controller's name where it is not the paper's."""
+    from turgor.control import CONTROLLERS
+
+    name = next(name for name, kind in CONTROLLERS.items() if kind is type(task.controller))
+    return [task.condition] if name == "linear" else [task.condition, name]
 
 
 def _unit(task: Task) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from turgor.body import Body
-from turgor.control import check_theta, observation_count, output_count, rows
+from turgor.control import check_theta, observation_count, output_count
 from turgor.errors import InvalidInput, describe
 from turgor.physics.batch import Batch, World, load_kernel
 from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH
@@ -87,7 +87,7 @@ class Simulator:
     def rollout(self, theta: ArrayLike, position: ArrayLike | None = None) -> Rollout:
         """A `Rollout` of every row of `theta` [agent, parameter] from the task's start, or from `position` [m],
         shape [agent, mass, 2]. Raises `InvalidInput` for another shape or numbers that are not finite."""
-        theta = check_theta(theta, self.task.body, self.task.condition)
+        theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
         starts = self._starts(len(theta), position)
         final = np.empty(starts.shape, dtype=np.float32)
         steps = np.empty(len(theta), dtype=np.int64)
@@ -95,7 +95,7 @@ class Simulator:
 
         def run(part: slice) -> None:
             batch = Batch(self._world, starts[part])
-            batch.think(*rows(theta[part], self.task.body, self.task.condition))
+            batch.think(theta[part])
             final[part], steps[part], solved[part] = self._run_whole(batch)
 
         self._spread(run, _parts(len(theta), self.threads))
@@ -104,10 +104,11 @@ class Simulator:
     def record(self, theta: ArrayLike, position: ArrayLike | None = None) -> Recording:
         """The `Recording` of one controller, `theta` [parameter], from the task's start or from `position`
         [mass, 2]: the same steps that `rollout` takes."""
-        theta = check_theta(np.reshape(np.asarray(theta), (1, -1)), self.task.body, self.task.condition)
+        theta = np.reshape(np.asarray(theta), (1, -1))
+        theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
         starts = self._starts(1, None if position is None else np.asarray(position)[None])
         batch = Batch(self._world, starts)
-        batch.think(*rows(theta, self.task.body, self.task.condition))
+        batch.think(theta)
         trace = batch.trace(self.task.steps)
         final, steps, solved = self._run_whole(batch, trace)
         out = self._judge(starts, final, steps, solved)

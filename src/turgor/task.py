@@ -19,7 +19,7 @@ import numpy as np
 from turgor import body as bodies
 from turgor import scene as scenes
 from turgor.body import GAS_CONSTANT, Body
-from turgor.control import Condition, Sensing, parameter_count
+from turgor.control import Condition, Controller, Linear, Sensing, check_body, make_controller, parameter_count
 from turgor.errors import InvalidInput, describe, one_of
 from turgor.scene import Scene
 from turgor.variants import (
@@ -57,6 +57,7 @@ class Task(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     scene: Scene
     position: Any  # [m], shape [mass, 2], the start
     condition: Condition = "pressure"
+    controller: Controller = Linear()
     physics: Physics = Physics()
     sensing: Sensing = Sensing()
     pressure_unit: float | None = None  # [Pa] of pressure change per unit of output; None: p_max / 1000
@@ -70,6 +71,9 @@ class Task(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         put(self, "position", start_position(self.position, self.body))
         if self.condition not in get_args(Condition):
             raise one_of("condition", get_args(Condition), self.condition)
+        if not isinstance(self.controller, Controller):
+            raise InvalidInput("controller: expected a Linear, MLP, Sinusoid or Distributed", describe(self.controller))
+        check_body(self.body, self.condition, self.controller)
         if not isinstance(self.steps, int) or not 1 <= self.steps <= 10_000_000:
             raise InvalidInput("steps: expected a whole number, 1 to 10000000", describe(self.steps))
         if isinstance(self.fitness, str) and self.fitness not in get_args(Fitness):
@@ -90,7 +94,7 @@ class Task(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     @property
     def parameter_count(self) -> int:
         """Length of a controller's theta."""
-        return parameter_count(self.body, self.condition)
+        return parameter_count(self.body, self.condition, self.controller)
 
     @property
     def duration(self) -> float:
@@ -176,14 +180,16 @@ def make_task(
     *,
     body: str | Body = "small",
     condition: Condition | None = None,
+    controller: str | Controller = "linear",
     seed: int = 0,
     **variants: Any,
 ) -> Task:
     """A `Task` of the paper: "hilly", "flat", "escape", "escape-authors" or "inflation".
 
     `body` is "small", "medium", "large" or a `Body`; `condition` is "pressure" (springs and pressure are
-    controlled, the default), "springs" or "passive"; `seed` draws the terrain. `variants` override any number
-    of the `paper` preset by its name (`gravity=9.81`, `window=15`, `observation="unit"`, ...;
+    controlled, the default), "springs" or "passive"; `controller` is "linear" (the paper's), "mlp", "sinusoid",
+    "distributed" or one of `turgor.control`, as in `Distributed(hidden=4)`; `seed` draws the terrain. `variants`
+    override any number of the `paper` preset by its name (`gravity=9.81`, `window=15`, `observation="unit"`, ...;
     `variant_names()` lists them). Raises `InvalidInput` for an unknown name or an impossible number.
     """
     if name not in TASKS:
@@ -195,7 +201,18 @@ def make_task(
         condition = "passive" if name == "inflation" else "pressure"
     size = body if isinstance(body, str) else "custom"
     body = _make_body(body, groups[Elements])
-    return TASKS[name](name, size, body, condition, seed, groups)
+    task = TASKS[name](name, size, body, condition, seed, groups)
+    return msgspec.structs.replace(task, controller=_given_controller(controller))
+
+
+def _given_controller(value: Any) -> Controller:
+    """`value` as a controller: its name, itself, or what its JSON says."""
+    if isinstance(value, str):
+        return make_controller(value)
+    try:
+        return msgspec.convert(value, Controller)
+    except msgspec.ValidationError as error:
+        raise InvalidInput(f"controller: {error}") from None
 
 
 def _grouped(variants: Mapping[str, Any]) -> dict[type, Any]:
@@ -320,8 +337,12 @@ TASKS: dict[str, Callable[..., Task]] = {
 
 
 def task_to_json(task: Task) -> bytes:
-    """`task` as JSON. Functions (own fitness, own end) are written by name alone."""
-    return msgspec.json.encode(task, enc_hook=_encode, order="deterministic")
+    """`task` as JSON. Functions (own fitness, own end) are written by name alone, a linear controller not at all: so
+    a task has the identity that it had before there were others."""
+    fields = msgspec.structs.asdict(task)
+    if task.controller == Linear():
+        del fields["controller"]
+    return msgspec.json.encode(fields, enc_hook=_encode)
 
 
 def task_from_json(data: bytes | Mapping[str, Any]) -> Task:
@@ -354,6 +375,7 @@ class TaskFields(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     fitness: Fitness
     end: Leave | None
     pressure: list[list[float]] | None
+    controller: Controller = Linear()
 
     def task(self) -> Task:
         fields = msgspec.structs.asdict(self)

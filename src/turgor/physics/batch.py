@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from turgor.body import Body
+from turgor.control import pack
 from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, room_for
 from turgor.physics.memory import LINE, Width, aligned, fields
 from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
@@ -74,11 +75,13 @@ class Batch:
     def own_scenes(self) -> bool:
         return self._scenes is not None
 
-    def think(self, weights: np.ndarray, biases: np.ndarray) -> None:
-        """Gives the agents their controllers: weights [agent, output, input], biases [agent, output]."""
+    def think(self, theta: np.ndarray) -> None:
+        """Gives the agents their controllers, `theta` [agent, parameter]."""
+        task = self._task
+        weights, biases = pack(theta, task.body, task.condition, task.controller, task.physics.dt)
         lanes = np.minimum(np.arange(self.blocks * WIDTH), self.agents - 1)  # the last agent in lanes left over
         for brain, agents in zip(self.brains, lanes.reshape(-1, WIDTH), strict=True):
-            self.kernel.field(brain, Brain, "weight")[:] = weights[agents].reshape(WIDTH, -1).T
+            self.kernel.field(brain, Brain, "weight")[:] = weights[agents].T
             self.kernel.field(brain, Brain, "bias")[:] = biases[agents].T
 
     def trace(self, steps: int) -> np.ndarray:

@@ -47,6 +47,8 @@ _options: dict[str, Any] = {
 stage = njit(forceinline=True, **_options)
 rare = njit(**_options)
 inlined = stage
+# Compiled once however many places call it: without the word, a function called from a stage is inlined like it.
+shared = njit(forceinline=False, **_options)
 
 # --- values -------------------------------------------------------------------------------------------------------
 

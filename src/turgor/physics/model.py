@@ -22,6 +22,8 @@ MARGIN = 1e-3
 
 # where commands come from
 CONTROLLER, COMMANDS, REPLAY = 0, 1, 2
+# which controller
+LINEAR, MLP, SINUSOID, DISTRIBUTED = 0, 1, 2, 3
 # where the pressure comes from
 GAS_LAW, CONTROLLED, GIVEN = 0, 1, 2
 
@@ -35,6 +37,10 @@ class Settings(NamedTuple):
     chambers: np.int32
     inputs: np.int32
     outputs: np.int32
+    controller: np.int32
+    hidden: np.int32  # units of a hidden layer
+    messages: np.int32  # each way along a spring
+    memory: np.int32  # numbers that the controller keeps
     chains: np.int32
     pairs: np.int32
     columns: np.int32  # room for them in a scene
@@ -83,6 +89,9 @@ class Model(NamedTuple):
     rest: Annotated[FloatTable, "spring"]  # [m]
     shortening: Annotated[FloatTable, "spring"]  # [m], from rest to shortest
     lengthening: Annotated[FloatTable, "spring"]  # [m], from rest to longest
+    first: Annotated[IntTable, "spring"]  # masses that it joins
+    second: Annotated[IntTable, "spring"]
+    strain_scale: Annotated[FloatTable, "spring"]  # [1/m]
     # chambers
     edge_start: Annotated[IntTable, "chamber_end"]  # first edge of each chamber, and the end of the last
     edge_from: Annotated[IntTable, "edge"]
@@ -141,6 +150,7 @@ class State(NamedTuple):
     total: Annotated[Floats, "input"]  # their sum
     age: Annotated[Floats, "one"]  # observations since the agent's start
     phase: Annotated[Floats, "one"]  # the last one's place among `window`, counted from the agent's start
+    memory: Annotated[Floats, "memory"]  # of the controller: see control.memory_count
     # the column that each mass is in, copied to the lanes: [mass]
     cell: Annotated[Ints, "mass"]  # its index
     left: Annotated[Floats, "mass"]  # [m]
@@ -197,6 +207,10 @@ class Work(NamedTuple):
     command: Annotated[Floats, "output"]
     mean: Annotated[Floats, "input"]  # of the window
     area: Annotated[Floats, "chamber"]  # [m^2], signed
+    # controllers: cosine and sine of the clock, or [mass, local input]; [mass, hidden]; [mass, local output]
+    local: Annotated[Floats, "local"]
+    hidden: Annotated[Floats, "hidden"]
+    answer: Annotated[Floats, "answer"]
     # displacement of this step [m]
     dx: Annotated[Floats, "mass"]
     dy: Annotated[Floats, "mass"]
@@ -230,8 +244,8 @@ class Work(NamedTuple):
 class Brain(NamedTuple):
     """The controllers of a block."""
 
-    weight: Annotated[Floats, "weight"]  # [output, input]
-    bias: Annotated[Floats, "output"]
+    weight: Annotated[Floats, "weight"]  # of all layers, [output, input] each: see control.pack
+    bias: Annotated[Floats, "bias"]
 
 
 class Script(NamedTuple):

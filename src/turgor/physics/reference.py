@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from turgor.body import Body
-from turgor.control import rows
+from turgor.control import MLP, Distributed, Linear, Sinusoid, output_count, turn_per_step
 from turgor.physics.reference_contacts import (
     Manifold,
     geometry,
@@ -51,6 +51,8 @@ class State:
     spring_impulse: np.ndarray  # [N s], shape [spring], for warm starting
     contacts: dict[Key, list[Stored]] = field(default_factory=dict)  # for warm starting
     window: deque[np.ndarray] = field(default_factory=deque)  # the last observations
+    phase: Any = 0.0  # [turn], in [0, 1), of a sinusoid
+    messages: Any = None  # of a distributed controller, on their way: [spring, forth and back, message]
 
 
 @dataclass
@@ -109,6 +111,7 @@ def start(
         touch=np.zeros(body.mass_count, dtype=bool),
         spring_impulse=np.zeros(body.spring_count, dtype),
         window=deque(maxlen=task.sensing.window),
+        messages=np.zeros((body.spring_count, 2, getattr(task.controller, "messages", 0))),
     )
 
 
@@ -118,7 +121,7 @@ def start(
 def step(state: State, task: Task, theta: ArrayLike | None = None) -> np.ndarray:
     """The observation that the controller `theta` saw; `state` is one step later."""
     observation = sense(state, task)
-    commands, pressure_change = control(observation, theta, task)
+    commands, pressure_change = control(state, observation, theta, task)
     actuate(state, task, commands, pressure_change)
     move(state, task)
     return observation
@@ -162,19 +165,84 @@ def sense(state: State, task: Task) -> np.ndarray:
     return np.mean(np.array(state.window), axis=0)
 
 
-def control(observation: np.ndarray, theta: ArrayLike | None, task: Task) -> tuple[np.ndarray, np.ndarray]:
+def control(
+    state: State, observation: np.ndarray, theta: ArrayLike | None, task: Task
+) -> tuple[np.ndarray, np.ndarray]:
     """Spring commands [1] and pressure changes [Pa]; zeros for what the condition does not control."""
-    # s = tanh(W_s o + b_s),  dp = p_unit (W_p o + b_p)
     body = task.body
     springs, chambers = np.zeros(body.spring_count), np.zeros(body.chamber_count)
     if task.condition == "passive":
         return springs, chambers
-    weights, bias = rows(np.asarray(theta).reshape(1, -1), body, task.condition)
-    output = (weights[0] @ observation + bias[0]).astype(observation.dtype)
+    thinking: dict[type, Any] = {Linear: linear, MLP: mlp, Sinusoid: sinusoid, Distributed: distributed}
+    think = thinking[type(task.controller)]
+    output = think(state, observation, np.asarray(theta, dtype=np.float64), task).astype(observation.dtype)
     springs = np.tanh(output[: body.spring_count])
     if task.condition == "pressure":
         chambers = task.pressure_step * output[body.spring_count :]
     return springs, chambers
+
+
+def take(theta: np.ndarray, outputs: int, inputs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weights [output, input], biases [output] of the layer that `theta` begins with, and the rest of theta."""
+    end = outputs * inputs
+    return theta[:end].reshape(outputs, inputs), theta[end : end + outputs], theta[end + outputs :]
+
+
+def heads(o: np.ndarray, theta: np.ndarray, task: Task) -> np.ndarray:
+    """W_s o + b_s, W_p o + b_p."""
+    w_s, b_s, theta = take(theta, task.body.spring_count, len(o))
+    w_p, b_p, _ = take(theta, task.body.chamber_count if task.condition == "pressure" else 0, len(o))
+    return np.concatenate([w_s @ o + b_s, w_p @ o + b_p])
+
+
+def linear(state: State, o: np.ndarray, theta: np.ndarray, task: Task) -> np.ndarray:
+    """W_s o + b_s, W_p o + b_p."""
+    return heads(o, theta, task)
+
+
+def mlp(state: State, o: np.ndarray, theta: np.ndarray, task: Task) -> np.ndarray:
+    """W_s h + b_s, W_p h + b_p  with  h = tanh(W_1 o + b_1)."""
+    assert isinstance(task.controller, MLP)
+    w, b, theta = take(theta, task.controller.hidden, len(o))
+    return heads(np.tanh(w @ o + b), theta, task)
+
+
+def sinusoid(state: State, o: np.ndarray, theta: np.ndarray, task: Task) -> np.ndarray:
+    """a cos 2 pi p + b sin 2 pi p + c  of the phase p, which advances."""
+    p = 2 * np.pi * state.phase
+    w, b, _ = take(theta[1:], output_count(task.body, task.condition), 2)
+    state.phase = (state.phase + turn_per_step(theta[0], task.physics.dt)) % 1
+    return w @ np.array([np.cos(p), np.sin(p)]) + b
+
+
+def distributed(state: State, o: np.ndarray, theta: np.ndarray, task: Task) -> np.ndarray:
+    """Of each mass: the command for the spring after it; of each chamber: its masses' mean vote. Messages are sent."""
+    body, controller = task.body, task.controller
+    assert isinstance(controller, Distributed)
+    n, m = body.mass_count, controller.messages
+    w_1, b_1, theta = take(theta, controller.hidden, 5 + 2 * m)
+    w_2, b_2, _ = take(theta, 1 + 2 * m + (task.condition == "pressure"), controller.hidden)
+    i, j = body.springs.T
+    length = np.linalg.norm(state.position[j] - state.position[i], axis=1)
+    span = body.rest_length * np.maximum(1 - body.shortest, body.longest - 1)
+    strain = np.clip((length - body.rest_length) / np.where(span > 0, span, np.inf), -1, 1)
+    if task.sensing.observation == "unit":
+        strain = (strain + 1) / 2
+    springs, votes = np.zeros(body.spring_count), np.zeros(n)
+    sent = np.zeros_like(state.messages)
+    for mass in range(n):
+        before, after = int(np.flatnonzero(j == mass)[0]), int(np.flatnonzero(i == mass)[0])
+        heard = np.concatenate([state.messages[before, 0], state.messages[after, 1]])
+        place = o[[mass, n + 2 * mass, n + 2 * mass + 1]]
+        h = np.tanh(w_1 @ np.concatenate([place, strain[[before, after]], heard]) + b_1)
+        answer = w_2 @ h + b_2
+        springs[after] = answer[0]
+        sent[before, 1], sent[after, 0] = np.tanh(answer[1 : 1 + m]), np.tanh(answer[1 + m : 1 + 2 * m])
+        votes[mass] = answer[-1]
+    state.messages = sent
+    if task.condition != "pressure":
+        return springs
+    return np.concatenate([springs, [votes[list(loop)].mean() for loop in body.chambers]])
 
 
 def actuate(state: State, task: Task, commands: np.ndarray, pressure_change: np.ndarray) -> None:

@@ -5,8 +5,9 @@ from functools import partial
 import numpy as np
 from numba import njit
 
-from turgor.physics.actuate import actuate, agent_of, control, take_commands, take_lengths
+from turgor.physics.actuate import actuate, agent_of, take_commands, take_lengths
 from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, first_column, note_travel
+from turgor.physics.control import control
 from turgor.physics.lanes import any_lane, rare, select, stage
 from turgor.physics.manifold import NO_ID
 from turgor.physics.memory import lane_count, views
@@ -34,7 +35,7 @@ def step(settings, model, ground, state, work, brain, script, commands, drive, f
     """Step t (from 0) of the block of agents `first` ... It starts from an observation and ends with the one that the
     next step needs."""
     if drive == CONTROLLER:
-        control(settings, brain, work)
+        control(settings, model, state, work, brain)
         actuate(settings, model, state, work)
     elif drive == COMMANDS:
         take_commands(settings, work, commands, first)
@@ -99,6 +100,8 @@ def put_at_start(settings, model, state, result, position, velocity, lane):
         state.window[k, lane] = 0.0
     for k in range(settings.inputs):
         state.total[k, lane] = 0.0
+    for k in range(settings.memory):
+        state.memory[k, lane] = 0.0
     state.age[0, lane] = 1.0
     state.phase[0, lane] = 0.0
     for slot in range(settings.masses * settings.slots):

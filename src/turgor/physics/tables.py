@@ -8,17 +8,32 @@ from typing import NamedTuple
 import numpy as np
 
 from turgor.body import Body
-from turgor.control import observation_count, output_count
+from turgor.control import (
+    MLP,
+    Distributed,
+    Linear,
+    Sinusoid,
+    local_input_count,
+    local_output_count,
+    memory_count,
+    observation_count,
+    output_count,
+    pack,
+)
 from turgor.errors import InvalidInput
+from turgor.physics import model
 from turgor.physics.ground import Columns, Room
 from turgor.physics.memory import aligned, field_of, fields, layout
 from turgor.physics.model import (
     CONTROLLED,
+    DISTRIBUTED,
     GAS_LAW,
     GIVEN,
+    LINEAR,
     MARGIN,
     NOWHERE,
     SHARED,
+    SINUSOID,
     VIEWS,
     WIDTH,
     Ground,
@@ -30,6 +45,7 @@ from turgor.physics.model import (
 from turgor.task import Leave, Task
 
 LARGEST = float(np.finfo(np.float32).max)
+KINDS: dict[type, int] = {Linear: LINEAR, MLP: model.MLP, Sinusoid: SINUSOID, Distributed: DISTRIBUTED}
 
 
 class Kernel(NamedTuple):
@@ -101,8 +117,8 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
         "script": 0,  # seen from the start of a buffer of its own
         "trace": 0,
         "window": observation_count(body) * task.sensing.window,
-        "weight": observation_count(body) * output_count(body, task.condition),
     }
+    lengths |= _controller_lengths(task)
     layouts = _layouts(lengths)
     buffer = aligned(1, layouts[0, len(fields(Model))])[0]
     settings = Settings(
@@ -112,6 +128,10 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
         chambers=np.int32(body.chamber_count),
         inputs=np.int32(lengths["input"]),
         outputs=np.int32(lengths["output"]),
+        controller=np.int32(KINDS[type(task.controller)] if lengths["output"] else LINEAR),
+        hidden=np.int32(getattr(task.controller, "hidden", 0)),
+        messages=np.int32(getattr(task.controller, "messages", 0)),
+        memory=np.int32(lengths["memory"]),
         chains=np.int32(lengths["chain"] - 1),
         pairs=np.int32(lengths["pair"]),
         columns=np.int32(room.columns),
@@ -186,6 +206,22 @@ def _pressure_source(task: Task) -> int:
     return CONTROLLED if task.condition == "pressure" else GAS_LAW
 
 
+def _controller_lengths(task: Task) -> dict[str, int]:
+    """Rows of the controller: its weights and biases, what it keeps, and room for what it works on."""
+    body, condition, controller = task.body, task.condition, task.controller
+    weights, biases = pack(np.zeros((1, task.parameter_count)), body, condition, controller, task.physics.dt)
+    masses = body.mass_count if isinstance(controller, Distributed) else 1
+    local = isinstance(controller, Distributed)
+    return {
+        "weight": weights.shape[1],
+        "bias": biases.shape[1],
+        "memory": memory_count(body, condition, controller),
+        "local": masses * local_input_count(controller) if local else 2,
+        "hidden": masses * getattr(controller, "hidden", 0),
+        "answer": masses * local_output_count(controller, condition) if local else 0,
+    }
+
+
 def _mass_tables(body: Body) -> dict[str, np.ndarray]:
     cosine, sine = np.cos(body.angle), np.sin(body.angle)
     return {
@@ -209,6 +245,7 @@ def _spring_tables(body: Body, dt: float) -> dict[str, np.ndarray]:
     c = 2 * body.damping_ratio[order] * omega / inverse
     softness = 1 / (dt * (c + dt * k))
     effective = 1 / (inverse + softness)
+    span = body.rest_length * np.maximum(1 - body.shortest, body.longest - 1)
     return {
         "tail": tail,
         "head": head,
@@ -220,6 +257,9 @@ def _spring_tables(body: Body, dt: float) -> dict[str, np.ndarray]:
         "rest": body.rest_length,
         "shortening": body.rest_length * (1 - body.shortest),
         "lengthening": body.rest_length * (body.longest - 1),
+        "first": body.springs[:, 0],
+        "second": body.springs[:, 1],
+        "strain_scale": np.divide(1, span, out=np.zeros(len(span)), where=span > 0),
     }
 
 
