@@ -115,8 +115,8 @@ def _evolve_options(parser: Parser) -> None:
         help="linear (the paper's), mlp (a hidden layer), sinusoid (open loop) or distributed (the same small "
         "network in every mass) (default: linear)",
     )
-    add("--hidden", type=int, metavar="N", help="units of the hidden layer (default: mlp 16, distributed 8)")
-    add("--messages", type=int, metavar="N", help="numbers sent each way along a spring (default: distributed 1)")
+    add("--hidden", type=whole, metavar="N", help="units of the hidden layer (default: mlp 16, distributed 8)")
+    add("--messages", type=whole, metavar="N", help="numbers sent each way along a spring (default: distributed 1)")
     add("--seed", type=whole, default=0, metavar="N", help="draws the terrain and drives the evolution (default: 0)")
     _evolution_options(parser, "evaluations, at least; whole generations (default: 10000)", 10_000)
     _strategy_options(parser)
