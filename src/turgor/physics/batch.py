@@ -53,7 +53,7 @@ class Batch:
     def __init__(self, world: World, position: np.ndarray, scenes: Sequence[Columns] | None = None) -> None:
         """`position` [m], shape [agent, mass, 2]: where the agents start."""
         self.agents = len(position)
-        self.position = np.ascontiguousarray(position, dtype=np.float32)
+        self.position = np.array(position, dtype=np.float32, order="C")  # writable: the kernel is compiled for that
         self.velocity = np.zeros_like(self.position)
         self.steps = 0  # made so far
         self._task = world.task

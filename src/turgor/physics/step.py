@@ -68,7 +68,7 @@ def begin(settings, model, state, work, result, fresh, position, velocity, first
     for lane in range(settings.lanes):
         agent = agent_of(first, lane, agents)
         if fresh[agent]:
-            put_at_start(settings, model, state, result, position[agent], velocity[agent], lane)
+            put_at_start(settings, model, state, result, position, velocity, agent, lane)
             begun = True
     if begun:
         state.travel[0] = 0.0  # all pairs are looked at again
@@ -78,13 +78,13 @@ def begin(settings, model, state, work, result, fresh, position, velocity, first
 
 
 @rare
-def put_at_start(settings, model, state, result, position, velocity, lane):
+def put_at_start(settings, model, state, result, position, velocity, agent, lane):
     """One agent into one lane."""
     for i in range(settings.masses):
-        state.x[i, lane] = position[i, 0]
-        state.y[i, lane] = position[i, 1]
-        state.vx[i, lane] = velocity[i, 0]
-        state.vy[i, lane] = velocity[i, 1]
+        state.x[i, lane] = position[agent, i, 0]
+        state.y[i, lane] = position[agent, i, 1]
+        state.vx[i, lane] = velocity[agent, i, 0]
+        state.vy[i, lane] = velocity[agent, i, 1]
         state.touch[i, lane] = 0.0
         # outside any column, so that the first step looks its column up
         state.left[i, lane] = np.inf
@@ -165,20 +165,19 @@ def hand_out(settings, model, state, work, result, observations, stands, first):
     for c in range(settings.chambers):
         work.area[c] = signed_area(model, state, c)
     for lane in range(min(settings.lanes, len(observations) - first)):
-        seen = observations[first + lane]
-        stand = stands[first + lane]
+        agent = first + lane
         for k in range(settings.inputs):
-            seen[k] = work.mean[k, lane]
+            observations[agent, k] = work.mean[k, lane]
         for i in range(n):
-            stand[2 * i] = state.x[i, lane]
-            stand[2 * i + 1] = state.y[i, lane]
-            stand[2 * n + 2 * i] = state.vx[i, lane]
-            stand[2 * n + 2 * i + 1] = state.vy[i, lane]
-            stand[4 * n + i] = state.touch[i, lane]
+            stands[agent, 2 * i] = state.x[i, lane]
+            stands[agent, 2 * i + 1] = state.y[i, lane]
+            stands[agent, 2 * n + 2 * i] = state.vx[i, lane]
+            stands[agent, 2 * n + 2 * i + 1] = state.vy[i, lane]
+            stands[agent, 4 * n + i] = state.touch[i, lane]
         for c in range(settings.chambers):
-            stand[5 * n + c] = state.pressure[c, lane]
-            stand[5 * n + settings.chambers + c] = work.area[c, lane]
-        stand[5 * n + 2 * settings.chambers] = result.solved[0, lane]
+            stands[agent, 5 * n + c] = state.pressure[c, lane]
+            stands[agent, 5 * n + settings.chambers + c] = work.area[c, lane]
+        stands[agent, 5 * n + 2 * settings.chambers] = result.solved[0, lane]
 
 
 def _run_blocks(
@@ -223,7 +222,7 @@ def _run_blocks(
 
 # The cache knows `width`, and through it the sources of all that is called here: see memory.Width. Where no folder can
 # be written to, there is no cache.
-_compile = partial(njit, nogil=True, error_model="numpy", boundscheck=False)
+_compile = partial(njit, nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True)
 try:
     run_blocks = _compile(cache=True)(_run_blocks)
 except RuntimeError:
