@@ -25,7 +25,7 @@ from turgor.control import (
     turn_per_step,
 )
 from turgor.errors import InvalidInput
-from turgor.physics import reference
+from turgor.physics import reference, reference_control
 from turgor.physics.control import sine
 from turgor.physics.memory import Floats, Width, aligned, field_of, layout, views
 from turgor.physics.model import WIDTH
@@ -296,6 +296,6 @@ def test_messages_travel_one_spring_a_step() -> None:
     for _ in range(5):
         state.touch[:] = touched
         state.window.clear()
-        commands, _ = reference.control(state, reference.sense(state, task), theta, task)
+        commands, _ = reference_control.control(state, reference_control.sense(state, task), theta, task)
         reached.append(set(np.flatnonzero(commands).tolist()))
     assert reached == [{3}, {3, 4}, {3, 4, 5}, {3, 4, 5, 6}, {3, 4, 5, 6, 7}]

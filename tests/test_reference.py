@@ -11,6 +11,7 @@ import pytest
 
 from turgor.body import LARGE, MEDIUM, SMALL, Body
 from turgor.physics import reference
+from turgor.physics.reference_control import observe
 from turgor.scene import GROUND_DEPTH, Scene, flat
 from turgor.task import Physics, Task, make_task
 
@@ -200,13 +201,13 @@ def test_observations_are_averaged_over_the_window() -> None:
     state = reference.start(task)
     single = []
     for _ in range(5):
-        single.append(reference.observe(state, task))
+        single.append(observe(state, task))
         np.testing.assert_allclose(reference.step(state, task), np.mean(single[-3:], axis=0), atol=1e-15)
 
 
 def test_unit_observations_are_the_signed_ones_shifted() -> None:
     signed, unit = (make_task("flat", observation=name) for name in ("signed", "unit"))
-    o, u = (reference.observe(crumpled(task), task) for task in (signed, unit))
+    o, u = (observe(crumpled(task), task) for task in (signed, unit))
     np.testing.assert_allclose(u[10:32], (o[10:32] + 1) / 2)
     np.testing.assert_array_equal(u[[*range(10), 32]], o[[*range(10), 32]])
 

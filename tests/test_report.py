@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from turgor.cli import COMMANDS
+from turgor.cli.command import Parser
 from turgor.experiments.analysis import by_cell, compare, find_effects
 from turgor.experiments.claims import check_claims
 from turgor.experiments.plan import make_plan
 from turgor.experiments.report import Film, Method, write_report
 from turgor.experiments.rows import Champion, Inflated, QuasiStatic, Tables, write_tables
-from turgor.terminal import Parser
 
 VOID = {"meta", "br", "hr", "img", "input", "link", "source", "wbr"}
 HOSTILE = '<script>alert("&")</script>'

@@ -1,0 +1,194 @@
+"""`turgor evolve` and `turgor resume`: a run is made, drawn and summed up."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from turgor.cli.champion import draw_video
+from turgor.cli.command import Command, Interrupted, Parser, add_threads, add_variants, count, number, whole
+from turgor.cli.progress import ProgressDisplay
+from turgor.cli.words import controlled, name_of, say, spread, unit_of
+
+if TYPE_CHECKING:
+    from turgor.runs import Champion, Run
+
+
+def _evolve_options(parser: Parser) -> None:
+    add = parser.add_argument
+    add("--task", default="hilly", metavar="NAME", help="hilly, flat, escape or escape-authors (default: hilly)")
+    add("--body", default="small", metavar="NAME", help="small, medium or large (default: small)")
+    add(
+        "--condition",
+        metavar="NAME",
+        help="what is controlled: pressure (springs and pressure) or springs (default: pressure)",
+    )
+    add(
+        "--controller",
+        default="linear",
+        metavar="NAME",
+        help="linear (the paper's), mlp (a hidden layer), sinusoid (open loop) or distributed (the same small "
+        "network in every mass) (default: linear)",
+    )
+    add("--hidden", type=whole, metavar="N", help="units of the hidden layer (default: mlp 16, distributed 8)")
+    add("--messages", type=whole, metavar="N", help="numbers sent each way along a spring (default: distributed 1)")
+    add("--seed", type=whole, default=0, metavar="N", help="draws the terrain and drives the evolution (default: 0)")
+    _evolution_options(parser, "evaluations, at least; whole generations (default: 10000)", 10_000)
+    _strategy_options(parser)
+    add(
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help="new folder of the run (default: runs/TASK-BODY-CONDITION-sSEED, with the controller's name before the "
+        "seed if it is not linear, with -2, -3 ... if that exists)",
+    )
+    add_variants(parser)
+
+
+def _strategy_options(parser: Parser) -> None:
+    from turgor.evolution import STRATEGIES
+
+    add, names = parser.add_argument, ", ".join(STRATEGIES)
+    add("--strategy", default="cma-es", metavar="NAME", help=f"the optimizer: {names} (default: cma-es)")
+    add("--population", type=count, metavar="N", help="agents in a generation (default: 4 + floor(3 ln parameters))")
+    add("--sigma", type=number, metavar="X", help="its first step size [1] (default: 0.5; openai-es: 0.3)")
+
+
+def _resume_options(parser: Parser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run")
+    _evolution_options(parser, "evaluations in all (default: those that the run was started with)", None)
+
+
+def _evolution_options(parser: Parser, text: str, default: int | None) -> None:
+    parser.add_argument("--evaluations", type=count, default=default, metavar="N", help=text)
+    add_threads(parser)
+    parser.add_argument("--no-video", action="store_true", help="do not draw champion.mp4 at the end")
+
+
+def _evolve(options: argparse.Namespace) -> None:
+    from turgor.control import Linear, make_controller
+    from turgor.task import make_task, variant_names
+
+    chosen = {name: getattr(options, name) for name in variant_names()}
+    variants = {name: value for name, value in chosen.items() if value is not None}
+    controller = make_controller(options.controller, hidden=options.hidden, messages=options.messages)
+    if controller != Linear():
+        variants["controller"] = controller
+    task = make_task(options.task, body=options.body, condition=options.condition, seed=options.seed, **variants)
+    from turgor.evolution.loop import evolve
+    from turgor.evolution.strategy import built_in
+    from turgor.runs import check_new, free_folder
+
+    given = {name: getattr(options, name) for name in ("population", "sigma") if getattr(options, name) is not None}
+    strategy = partial(built_in(options.strategy), **given)
+    out = options.out or free_folder("-".join([task.name, options.body, *controlled(task), f"s{options.seed}"]))
+    check_new(out)
+    recipe = {"name": task.name, "body": options.body, "condition": task.condition, "seed": options.seed, **variants}
+    say(
+        f"evolving {name_of(task, recipe)}: {task.parameter_count:,} parameters, {options.evaluations:,} evaluations "
+        f"-> {out}"
+    )
+    run = _watched(
+        out,
+        lambda display: evolve(
+            task,
+            options.evaluations,
+            options.seed,
+            out,
+            strategy=strategy,
+            threads=options.threads,
+            progress=display,
+            recipe=recipe,
+        ),
+    )
+    _finish(run, options)
+
+
+def _resume(options: argparse.Namespace) -> None:
+    from turgor.evolution.loop import resume
+    from turgor.runs import Run, current_versions
+
+    run = Run.open(options.run)
+    now = current_versions()
+    changed = [f"{name} {was} -> {now[name]}" for name, was in run.versions.items() if now.get(name, was) != was]
+    if changed:
+        say(f"note: {', '.join(changed)}: results may differ from those of a run without a pause")
+    say(f"resuming {name_of(run.task, run.settings.recipe)} after {run.evaluations:,} evaluations -> {run.path}")
+    run = _watched(
+        options.run, lambda display: resume(run, options.evaluations, threads=options.threads, progress=display)
+    )
+    _finish(run, options)
+
+
+def _watched(out: Path, work: Callable[[ProgressDisplay], Run]) -> Run:
+    """What `work` returns, with its progress shown; Ctrl-C becomes a line that tells what is kept."""
+    try:
+        with ProgressDisplay() as display:
+            return work(display)
+    except KeyboardInterrupt:
+        kept = (out / "run.json").exists()
+        raise Interrupted(f"kept in {out}; turgor resume {out} goes on" if kept else "nothing to keep yet") from None
+
+
+def _finish(run: Run, options: argparse.Namespace) -> None:
+    """Draws the run and sums it up."""
+    from turgor.view.figures import fitness_figure
+
+    assert run.path is not None
+    started = time.perf_counter()
+    name, unit, champion = name_of(run.task, run.settings.recipe), unit_of(run.task), run.checked_champion()
+    fitness_figure(run.history, run.path / "fitness.png", unit=unit.strip(), title=name)
+    (run.path / "champion.mp4").unlink(missing_ok=True)  # of a run resumed: an earlier champion's
+    if not options.no_video:
+        say("drawing champion.mp4 ...")
+        try:
+            draw_video(run, run.path / "champion.mp4", (1280, 720))
+        except KeyboardInterrupt:
+            raise Interrupted(f"kept in {run.path}, whole; turgor video {run.path} draws it") from None
+    drawing = time.perf_counter() - started
+
+    if run.note:
+        say(f"note     {run.note}")
+    say(f"best     {champion.fitness:.3f}{unit}, generation {champion.generation} of {run.generation}")
+    say(f"robust   {spread(champion.robust, unit)}, of {len(champion.robust)} starts moved by 1e-6 m")
+    if run.task.end is not None:
+        solver = "none" if run.solver is None else f"{run.solver.fitness:.3f}{unit} after {_duration(run, run.solver)}"
+        say(f"solved   best: {'yes' if champion.solved else 'no'}; best that solves the task: {solver}")
+    s = run.seconds
+    say(
+        f"time     {s['total']:.1f} s: simulation {s['simulation']:.1f}, {run.settings.strategy} {s['strategy']:.1f}, "
+        f"start {s['start']:.1f}, rest {s['rest']:.1f}; drawing {drawing:.1f} s"
+    )
+    say(f"folder   {run.path}: {' '.join(sorted(file.name for file in run.path.iterdir()))}")
+    say(f"next     turgor evaluate {run.path}")
+    say(f"         turgor resume {run.path} --evaluations {2 * run.settings.evaluations}")
+
+
+def _duration(run: Run, champion: Champion) -> str:
+    """Simulated time until the champion had solved the task."""
+    return f"{champion.steps * run.task.physics.dt:.1f} s"
+
+
+EVOLVE = Command(
+    "Evolve a controller, and leave a run: champion, history, curve, video.",
+    "examples:\n"
+    "  turgor evolve\n"
+    "  turgor evolve --task escape --body large --condition springs --seed 3\n"
+    "  turgor evolve --body large --strategy sep-cma-es --population 50\n"
+    "  turgor evolve --gravity 9.81 --window 15 --observation unit --out runs/variant",
+    _evolve_options,
+    _evolve,
+)
+
+RESUME = Command(
+    "Go on with a run that was interrupted, or evolve a finished one further.",
+    "examples:\n"
+    "  turgor resume runs/hilly-small-pressure-s0\n"
+    "  turgor resume runs/hilly-small-pressure-s0 --evaluations 20000",
+    _resume_options,
+    _resume,
+)
