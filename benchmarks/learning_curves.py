@@ -67,7 +67,7 @@ def draw(rows: list[tuple[str, str, int, int, float]], path: Path) -> None:
         axes.grid(alpha=0.2)
         axes.set_xlim(0)
     figure.axes[0].set_ylabel("fitness [m/s]")
-    figure.axes[0].legend(frameon=False, loc="upper left")
+    figure.axes[-1].legend(frameon=False, loc="center right", bbox_to_anchor=(1.0, 0.45))
     figure.savefig(path, dpi=110)
 
 
