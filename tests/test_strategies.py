@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 import re
@@ -364,9 +365,9 @@ def test_whatever_the_fitness_it_goes_on_or_says_that_it_cannot(
 
 @pytest.mark.parametrize("name", EVERY)
 def test_example_in_the_docstring_runs(name: str) -> None:
-    text = built_in(name).__doc__ or ""
-    blocks = re.findall(r"\n\n((?: {8}.*\n)+)", text)
-    code = "\n".join(line[8:] for line in blocks[0].splitlines()).replace("range(100)", "range(3)")
+    text = inspect.getdoc(built_in(name)) or ""
+    blocks = re.findall(r"\n\n((?: {4}.*\n)+)", text)
+    code = "\n".join(line[4:] for line in blocks[0].splitlines()).replace("range(100)", "range(3)")
     names: dict[str, Any] = {"np": np, built_in(name).__name__: built_in(name)}
     exec(code, names)
     assert names["theta"].shape == (names["strategy"].population, len(names["theta"][0]))
