@@ -78,7 +78,7 @@ def export_replays(replays: Sequence[bytes], title: str | None = None) -> str:
     first = headers[0]
     about = "; ".join(f"{'AB'[k]}: {line}" for k, line in enumerate(told)) if len(told) > 1 else told_fitness(first)
     about += f", {first.steps * first.dt:g} s at {1 / first.dt:.0f} steps/s"
-    body = '<main id="player"></main>\n' + "".join(_data_block(k, replay) for k, replay in enumerate(replays))
+    body = '<main id="place"></main>\n' + "".join(_data_block(k, replay) for k, replay in enumerate(replays))
     return _page(heading, about, body, inlined("exported.js", "showReplays"))
 
 
@@ -146,6 +146,7 @@ def _page(title: str, about: str, body: str, script: str) -> str:
         "default-src": "'none'",
         "script-src": _digest(script),
         "style-src": _digest(style),
+        "img-src": "data:",  # the empty icon, in place of one that would be asked for
         "base-uri": "'none'",
         "form-action": "'none'",
     }

@@ -11,7 +11,7 @@ The header's fields (`Header`, where the units are) end with `arrays`: name, typ
 of the stream, the last axis fastest. Index t is the state after step t, as in a `Recording`:
 
     origin     int32    [mass, 2]                      position at t = 0 [mm]
-    position   int16    [steps, mass, 2]               position at t + 1 - position at t [mm]; int32 where that is needed
+    position   int16    [steps, mass, 2]               position at t + 1 - that at t [mm]; int32 where needed
     rest       uint8    [steps + 1, spring]            commanded length: 0 is spring_range[0], 255 spring_range[1]
     pressure   float32  [steps + 1, chamber]           [Pa]
     touch      uint8    [steps + 1, ceil(mass / 8)]    a bit a mass, the first the highest of its byte; 1: it touches
@@ -142,7 +142,7 @@ def replay_of_recording(recording: Recording, task: Task | None = None, *, every
     if not (np.abs(position) < 2**30 * MILLIMETRE).all():  # NaN as well
         raise InvalidInput("recording: expected finite positions within 1000 km", "NaN, infinity or further")
     arrays, spring_range = _arrays(recording, position, every)
-    defaults = {
+    defaults: dict[str, Any] = {
         "title": "",
         "unit": "",
         "fitness": recording.fitness,

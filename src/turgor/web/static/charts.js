@@ -17,15 +17,17 @@ export class Charts {
     this.element = element;
     this.duration = Math.max(...replays.map((replay) => replay.duration), 1e-9);
     this.strips = this.#strips();
-    this.canvas = document.createElement("canvas");
+    this.canvas = document.createElement("canvas"); // all that does not move
     this.canvas.className = "player-chart";
     this.canvas.setAttribute("role", "img");
+    this.moving = document.createElement("canvas"); // over it
+    this.moving.className = "player-playhead";
+    this.moving.setAttribute("aria-hidden", "true");
     const names = this.strips.map((strip) => strip.name).join(", ");
     this.canvas.setAttribute("aria-label", `Charts over time: ${names}. The slider moves through time.`);
     this.height = this.strips.reduce((sum, strip) => sum + HEAD + strip.height, AXIS);
-    this.canvas.style.height = `${this.height}px`;
-    element.append(this.canvas);
-    this.still = document.createElement("canvas"); // all that does not move
+    this.canvas.style.height = this.moving.style.height = `${this.height}px`;
+    element.append(this.canvas, this.moving);
     this.resizing = new ResizeObserver(() => this.redraw());
     this.resizing.observe(this.canvas);
     const { signal } = this.#abort;
@@ -46,6 +48,7 @@ export class Charts {
     this.#abort.abort();
     this.resizing.disconnect();
     this.canvas.remove();
+    this.moving.remove();
   }
 
   #strips() {
@@ -76,7 +79,7 @@ export class Charts {
     const width = this.canvas.clientWidth;
     if (!width) return;
     const ratio = window.devicePixelRatio || 1;
-    for (const canvas of [this.canvas, this.still]) {
+    for (const canvas of [this.canvas, this.moving]) {
       canvas.width = Math.round(width * ratio);
       canvas.height = Math.round(this.height * ratio);
     }
@@ -86,8 +89,9 @@ export class Charts {
       text: colour("--fg"), faint: colour("--muted"), line: colour("--line"), curves: [colour("--a"), colour("--b")],
     };
     this.width = width;
+    this.drawn = 0; // [px], where the line was
     this.ratio = ratio;
-    const context = this.still.getContext("2d");
+    const context = this.canvas.getContext("2d");
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, this.height);
     let top = 0;
@@ -106,12 +110,13 @@ export class Charts {
   draw(time) {
     this.time = time;
     if (!this.width) return;
-    const context = this.canvas.getContext("2d");
-    context.setTransform(1, 0, 0, 1, 0, 0);
-    context.clearRect(0, 0, this.canvas.width, this.canvas.height);
-    context.drawImage(this.still, 0, 0);
+    const context = this.moving.getContext("2d");
     context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     const x = this.#x(time);
+    // only where something was
+    context.clearRect(this.drawn - 6, 0, 12, this.height);
+    for (const strip of this.strips) context.clearRect(this.width / 2, strip.top - HEAD, this.width / 2, HEAD);
+    this.drawn = x;
     context.fillStyle = this.colours.text;
     const last = this.strips.at(-1);
     context.fillRect(x - 0.75, HEAD - 4, 1.5, (last ? last.top + last.height : 0) - HEAD + 8);

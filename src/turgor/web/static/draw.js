@@ -109,13 +109,15 @@ export class World {
     const ground = this.between(camera.left, camera.right);
     this.#drawGround(context, camera, palette, ground);
     for (const [polygons, colour] of [[this.solid, palette.solid], [this.surface, palette.edge]]) {
-      context.fillStyle = colour;
+      context.fillStyle = context.strokeStyle = colour;
+      context.lineWidth = 1;
       context.beginPath();
       for (const corners of polygons) {
         corners.forEach(([x, y], k) => context[k ? "lineTo" : "moveTo"](camera.px(x), camera.py(y)));
         context.closePath();
       }
       context.fill("nonzero");
+      if (colour === palette.solid) context.stroke(); // no seam where two meet
     }
     if (ruler) this.#drawRuler(context, camera, palette, ground, text);
   }
@@ -216,7 +218,8 @@ export function drawBody(context, replay, t, camera, palette, { trail = true } =
     fillSquare(context, x[i], y[i], 0.72 * size, header.angle[i], touching ? palette.touching : palette.mass);
   }
   const [cx, cy] = centreAt(replay.com, t);
-  for (const [radius, colour] of [[5, palette.ink], [3.4, palette.centre]]) {
+  const dot = Math.min(Math.max(side / 9, 0.5), 1); // smaller in small pictures
+  for (const [radius, colour] of [[5 * dot, palette.ink], [3.4 * dot, palette.centre]]) {
     context.fillStyle = colour;
     context.beginPath();
     context.arc(camera.px(cx), camera.py(cy), radius, 0, 2 * Math.PI);

@@ -20,7 +20,7 @@ export function switchTheme(button) {
 /** The page's player, once it can play. */
 export async function showReplays() {
   switchTheme(document.getElementById("theme"));
-  const place = document.getElementById("player");
+  const place = document.getElementById("place");
   try {
     const replays = await Promise.all([...document.querySelectorAll("script.replay")].map((s) => loadReplay(bytesIn(s))));
     globalThis.player = new Player(place, replays, { autoplay: true, loop: true, title: document.title });
