@@ -290,7 +290,7 @@ def test_gallery_moves_what_is_in_sight_and_opens_large(browser: Any, folder: Pa
         assert page.get_by_role("dialog").is_visible()
         page.keyboard.press("Escape")
         assert not page.get_by_role("dialog").is_visible()
-        assert page.locator(".player").count() == 0
+        until(page, "!document.querySelector('.player')")
 
 
 def test_a_gallery_of_many_reads_only_what_is_in_sight(browser: Any, folder: Path, tmp_path: Path) -> None:

@@ -73,11 +73,12 @@ def export_replays(replays: Sequence[bytes], title: str | None = None) -> str:
     if not 1 <= len(replays) <= 2:
         raise InvalidInput("replays: expected one or two", str(len(replays)))
     headers = [read_header(replay) for replay in replays]
-    told = [f"{header.title}: {told_fitness(header)}" for header in headers]
     heading = title or " and ".join(header.title for header in headers)
     first = headers[0]
-    about = "; ".join(f"{'AB'[k]}: {line}" for k, line in enumerate(told)) if len(told) > 1 else told_fitness(first)
-    about += f", {first.steps * first.dt:g} s at {1 / first.dt:.0f} steps/s"
+    about = "; ".join(f"{'AB'[k]}: {told_fitness(h)}" for k, h in enumerate(headers)).removeprefix(
+        "A: " if len(headers) == 1 else ""
+    )
+    about += f"; {first.steps * first.dt:g} s at {1 / first.dt:.0f} steps/s"
     body = '<main id="place"></main>\n' + "".join(_data_block(k, replay) for k, replay in enumerate(replays))
     return _page(heading, about, body, inlined("exported.js", "showReplays"))
 

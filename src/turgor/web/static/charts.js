@@ -161,7 +161,7 @@ export class Charts {
     context.fillStyle = faint;
     const { spring_range: range } = strip.heat?.header ?? {};
     const unit = range ? `${Math.round(100 * (range[0] - 1))}% (blue) to +${Math.round(100 * (range[1] - 1))}% (red)` : strip.unit;
-    if (unit) context.fillText(`[${unit.replace("-", "−")}]`.replace(/^\[(.*\(.*)\]$/, "$1"), past, strip.top - 6);
+    if (unit) context.fillText(range ? unit.replace("-", "−") : `[${unit}]`, past, strip.top - 6, this.width - RIGHT - past);
     context.strokeStyle = line;
     context.lineWidth = 1;
     context.strokeRect(GUTTER - 0.5, strip.top - 0.5, width + 1, strip.height + 1);

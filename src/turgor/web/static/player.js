@@ -568,6 +568,7 @@ export class Player {
     }
     const margin = Math.round(10 * text);
     const above = panel + 210 * text + 2 * margin <= width;
+    if (!above && height < 300) return; // no room beside the body
     const wide = above ? 210 * text : Math.min(210 * text, (width - 3 * margin) / 2);
     const tall = 54 * text;
     bars.forEach((bar, n) => {
