@@ -65,7 +65,7 @@ export function showGallery() {
       dialog.setAttribute("aria-label", replay.header.title);
       dialog.showModal();
       globalThis.player = new Player(place, [replay], { autoplay: true, loop: true, charts: window.innerHeight > 800 });
-      globalThis.player.root.focus(); // so that the space bar plays, and does not close
+      globalThis.player.root.focus({ preventScroll: true }); // so that the space bar plays, and does not close
     });
   }
   dialog.querySelector("button").addEventListener("click", () => dialog.close());
