@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -167,7 +168,7 @@ def test_help_imports_nothing_heavy() -> None:
         (["video", "full"], "full: expected the folder of a run; got no run.json in it"),
         (["video", "made", "--size", "big"], "--size: expected WIDTHxHEIGHT in pixels, as in 1280x720; got 'big'"),
         (["video", "made", "--size", "7x7"], "size: expected"),
-        (["video", "made", "--out", "a.avi"], "format of the video: expected one of .mp4, .webm; got '.avi'"),
+        (["video", "made", "--out", "a.avi"], "format of the video: expected one of .mp4, .webm, .gif; got '.avi'"),
         (["video", "made", "--out", "nowhere/a.mp4"], "expected a file in a folder that exists; got nowhere/a.mp4"),
         (["evaluate", "broken"], "champion.npz: expected theta as float64 [374]; got float64 [7]"),
         (["evaluate", "young"], "young: expected a run with a champion; got none yet (no champion.npz)"),
@@ -297,6 +298,19 @@ def test_video_of_another_size(here: Path, made: Path, capsys: pytest.CaptureFix
     assert main(["video", str(made), "--out", "champion.webm", "--size", "128x96"]) == 0
     assert (here / "champion.webm").stat().st_size > 1000
     assert capsys.readouterr().out == "champion.webm\n"
+
+
+def test_video_of_a_part_in_another_format(here: Path, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(made, here / "run")
+    argv = ["video", "run", "--format", "gif", "--size", "128x96", "--from", "0.5", "--to", "1"]
+    assert main(argv) == 0
+    assert capsys.readouterr().out == str(Path("run") / "champion.gif") + "\n"
+    with av.open(str(here / "run" / "champion.gif")) as container:
+        assert len(list(container.decode(video=0))) == 13
+    assert main([*argv, "--out", "champion.mp4"]) == 2
+    assert "--format: expected --out to end with .gif; got champion.mp4" in capsys.readouterr().err
+    assert main(["video", "run", "--from", "3"]) == 2
+    assert "expected 0 <= start <= stop <= 2 s" in capsys.readouterr().err
 
 
 # --- signals, pipes, terminals ------------------------------------------------------------------------------------

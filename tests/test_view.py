@@ -273,6 +273,18 @@ def test_video_of_a_width_that_is_padded_in_memory(tmp_path: Path) -> None:
     assert np.abs(frame.to_ndarray(format="rgb24") - expected).mean() < 6
 
 
+def test_gif_has_25_frames_a_second_and_plays_again(tmp_path: Path) -> None:
+    recording = rolling(seconds=1)
+    path = write_video(recording, tmp_path / "video.gif", size=SMALL_FRAME, start=0.2)
+    assert path.read_bytes()[:6] == b"GIF89a"
+    assert b"NETSCAPE2.0" in path.read_bytes()  # again and again
+    with av.open(str(path)) as container:
+        frames = list(container.decode(video=0))
+    assert [frame.pts for frame in frames] == list(range(0, 84, 4))  # [1/100 s]
+    expected = draw_frame(recording, 12 + 24, SMALL_FRAME).astype(int)
+    assert np.abs(frames[10].to_ndarray(format="rgb24") - expected).mean() < 6
+
+
 def test_frames_show_the_nearest_step() -> None:
     recording = rolling(seconds=1)
     assert frame_steps(recording, 60, 0.0, None) == list(range(61))
@@ -285,7 +297,8 @@ def test_frames_show_the_nearest_step() -> None:
 def test_videos_that_cannot_be_made_are_refused(tmp_path: Path) -> None:
     recording, path = rolling(seconds=0.5), tmp_path / "video.mp4"
     cases = (
-        (path.with_suffix(".gif"), {}, r"expected one of \.mp4, \.webm"),
+        (path.with_suffix(".avi"), {}, r"expected one of \.mp4, \.webm, \.gif"),
+        (path.with_suffix(".gif"), {"fps": 60}, "fps: expected at most 50"),
         (path, {"size": (321, 180)}, "even width and height"),
         (path, {"fps": 0}, "fps: expected"),
         (path, {"fps": float("nan")}, "fps: expected"),

@@ -9,6 +9,7 @@ from turgor.cli.bench import BENCH
 from turgor.cli.champion import EVALUATE, VIDEO
 from turgor.cli.command import Command, Interrupted, Parser, did_you_mean
 from turgor.cli.evolve import EVOLVE, RESUME
+from turgor.cli.export import EXPORT
 from turgor.cli.reproduce import REPRODUCE
 from turgor.cli.words import say
 from turgor.errors import InvalidInput
@@ -20,6 +21,7 @@ COMMANDS: dict[str, Command] = {
     "resume": RESUME,
     "evaluate": EVALUATE,
     "video": VIDEO,
+    "export": EXPORT,
     "reproduce": REPRODUCE,
     "bench": BENCH,
 }

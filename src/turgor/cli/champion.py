@@ -6,11 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from turgor.cli.command import Command, Parser, add_threads, count
+from turgor.cli.command import Command, Parser, add_threads, count, number
 from turgor.cli.words import name_of, say, spread, unit_of
+from turgor.errors import InvalidInput
 
 if TYPE_CHECKING:
     from turgor.runs import Run
+
+FORMATS = ("mp4", "webm", "gif")  # of a video
 
 
 # --- evaluate -----------------------------------------------------------------------------------------------------
@@ -91,9 +94,12 @@ EVALUATE = Command(
 def _video_options(parser: Parser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run")
     parser.add_argument(
-        "--out", type=Path, metavar="FILE", help=".mp4 or .webm (default: champion.mp4 in the run's folder)"
+        "--out", type=Path, metavar="FILE", help=".mp4, .webm or .gif (default: champion.mp4 in the run's folder)"
     )
-    parser.add_argument("--size", type=_size, default=(1280, 720), metavar="WxH", help="pixels (default: 1280x720)")
+    parser.add_argument("--format", choices=FORMATS, help="mp4, webm or gif (default: what FILE ends with)")
+    parser.add_argument("--size", type=_size, metavar="WxH", help="pixels (default: 1280x720, of a GIF 640x360)")
+    parser.add_argument("--from", type=number, default=0.0, dest="start", metavar="S", help="first second (default: 0)")
+    parser.add_argument("--to", type=number, dest="stop", metavar="S", help="last second (default: the end)")
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -107,25 +113,29 @@ def _video(options: argparse.Namespace) -> None:
     from turgor.runs import Run
 
     run = Run.open(options.run)
-    path = draw_video(run, options.out or options.run / "champion.mp4", options.size)
-    say(str(path))
+    path = options.out or options.run / f"champion.{options.format or 'mp4'}"
+    if options.format is not None and path.suffix.lower() != f".{options.format}":
+        raise InvalidInput(f"--format: expected --out to end with .{options.format}", str(path))
+    size = options.size or ((640, 360) if path.suffix.lower() == ".gif" else (1280, 720))
+    say(str(draw_video(run, path, size, start=options.start, stop=options.stop)))
 
 
-def draw_video(run: Run, path: Path, size: tuple[int, int]) -> Path:
+def draw_video(run: Run, path: Path, size: tuple[int, int], *, start: float = 0.0, stop: float | None = None) -> Path:
     from turgor.simulate import Simulator
     from turgor.view.video import write_video
 
     champion = run.checked_champion()
     recording = Simulator(run.task, threads=1).record(champion.theta)
     title = f"{name_of(run.task, run.settings.recipe)}: {champion.fitness:.2f}{unit_of(run.task)}"
-    return write_video(recording, path, size=size, title=title)
+    return write_video(recording, path, size=size, start=start, stop=stop, title=title)
 
 
 VIDEO = Command(
     "Draw a run's champion as a video, at 60 frames/s, without any display.",
     "examples:\n"
     "  turgor video runs/hilly-small-pressure-s0\n"
-    "  turgor video runs/hilly-small-pressure-s0 --out champion.webm --size 1920x1080",
+    "  turgor video runs/hilly-small-pressure-s0 --out champion.webm --size 1920x1080\n"
+    "  turgor video runs/hilly-small-pressure-s0 --format gif --from 5 --to 10",
     _video_options,
     _video,
 )

@@ -25,7 +25,9 @@ VP9 = {"crf": "32", "b": "0", "deadline": "realtime", "cpu-used": "7"}
 FORMATS: dict[str, tuple[str, dict[str, str], dict[str, str]]] = {
     ".mp4": ("libx264", X264, {"movflags": "+faststart"}),
     ".webm": ("libvpx-vp9", VP9, {}),
+    ".gif": ("gif", {}, {}),
 }
+GIF_SAMPLES = 40  # frames that a GIF's 256 colours are chosen from
 PIXELS = "bgr0" if sys.byteorder == "little" else "0rgb"  # how a 32-bit surface lies in memory
 BT709 = 1  # the number of this standard's colours in H.264 and VP9: what players expect of HD video
 LIMITED_RANGE = 1  # brightness from 16 to 235
@@ -36,7 +38,7 @@ def write_video(
     path: str | os.PathLike[str],
     *,
     size: tuple[int, int] = (1280, 720),
-    fps: float = 60,
+    fps: float | None = None,
     start: float = 0.0,
     stop: float | None = None,
     title: str = "",
@@ -46,10 +48,11 @@ def write_video(
 ) -> Path:
     """Path of the video of `recording` from `start` to `stop` [s], both included; None: to the end.
 
-    The suffix chooses the format: .mp4 (H.264) or .webm (VP9). A frame shows the step nearest to its time: at
-    60 frames/s and dt = 1/60 s, one frame a step. `crf` is the encoder's constant rate factor: the higher, the smaller
-    the file and the coarser the picture (None: 20 for H.264, 32 for VP9). `progress(done, total)` is called after
-    each frame.
+    The suffix chooses the format: .mp4 (H.264), .webm (VP9) or .gif (256 colours, played again and again). A frame
+    shows the step nearest to its time: at 60 frames/s and dt = 1/60 s, one frame a step. `fps` None: 60, of a GIF 25;
+    a GIF tells times in 1/100 s, and players slow down more than 50 frames/s. `crf` is the encoder's constant rate
+    factor: the higher, the smaller the file and the coarser the picture (None: 20 for H.264, 32 for VP9).
+    `progress(done, total)` is called after each frame.
     The file appears under its name once it is whole. Raises `InvalidInput`.
     """
     path = Path(path)
@@ -61,12 +64,19 @@ def write_video(
         raise InvalidInput("size: expected an even width and height for video", describe(size))
     if crf is not None and not (isinstance(crf, int) and 0 <= crf <= 51):
         raise InvalidInput("crf: expected a whole number from 0 to 51", describe(crf))
+    gif = path.suffix.lower() == ".gif"
+    fps = (25 if gif else 60) if fps is None else fps
     steps = frame_steps(recording, fps, start, stop)
+    if gif and fps > 50:
+        raise InvalidInput("fps: expected at most 50 frames/s for a GIF", describe(fps))
     painter = Painter(recording, size, title, pressure_range=pressure_range)
     # av knows the format by the suffix
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
-        _encode(painter, steps, partial, fps, crf, progress)
+        if gif:
+            _encode_gif(painter, steps, partial, fps, progress)
+        else:
+            _encode(painter, steps, partial, fps, crf, progress)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
@@ -123,6 +133,70 @@ def _encode(
                     progress(k + 1, len(steps))
             before.result()
         container.mux(stream.encode(None))
+
+
+def _encode_gif(
+    painter: Painter, steps: list[int], path: Path, fps: float, progress: Callable[[int, int], object] | None
+) -> None:
+    """Chooses the colours from some of the frames, then draws them all: what is in memory does not grow with them."""
+    import av
+    import av.filter
+
+    def picture(step: int, k: int = 0) -> Any:
+        frame = av.VideoFrame(*painter.size, PIXELS)
+        _copy(painter.surface(step), frame)
+        frame.pts, frame.time_base = k, Fraction(1, 100)
+        return frame
+
+    first = picture(steps[0])
+    choose = av.filter.Graph()
+    choose.link_nodes(
+        choose.add_buffer(width=first.width, height=first.height, format=first.format, time_base=Fraction(1, 100)),
+        choose.add("palettegen", "reserve_transparent=0"),
+        choose.add("buffersink"),
+    ).configure()
+    for step in steps[:: -(-len(steps) // GIF_SAMPLES)]:
+        choose.push(picture(step))
+    choose.push(None)
+    palette: Any = choose.pull()
+    palette.time_base = Fraction(1, 100)
+
+    paint = av.filter.Graph()
+    frames, colours = (
+        paint.add_buffer(width=f.width, height=f.height, format=f.format, time_base=Fraction(1, 100))
+        for f in (first, palette)
+    )
+    # no dithering: flat colours stay flat, and small
+    use, sink = paint.add("paletteuse", "dither=none:diff_mode=rectangle"), paint.add("buffersink")
+    frames.link_to(use, 0, 0)
+    colours.link_to(use, 0, 1)
+    use.link_to(sink)
+    paint.configure()
+    colours.push(palette)
+    colours.push(None)
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("gif", rate=Fraction(fps).limit_denominator(1001))
+        stream.width, stream.height, stream.pix_fmt = *painter.size, "pal8"
+        stream.codec_context.time_base = Fraction(1, 100)
+        for k, step in enumerate(steps):
+            frames.push(picture(step, round(100 * k / fps)))
+            _drain(paint, stream, container)
+            if progress is not None:
+                progress(k + 1, len(steps))
+        frames.push(None)
+        _drain(paint, stream, container)
+        container.mux(stream.encode(None))
+
+
+def _drain(graph: Any, stream: Any, container: Any) -> None:
+    import av
+
+    while True:
+        try:
+            container.mux(stream.encode(graph.pull()))
+        except (av.BlockingIOError, av.EOFError):
+            return
 
 
 def _stream(container: Any, codec: str, options: dict[str, str], size: tuple[int, int], rate: Fraction) -> Any:
