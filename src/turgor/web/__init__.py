@@ -1,0 +1,1 @@
+"""The viewer: runs, replays and a playground in the browser."""
