@@ -43,7 +43,7 @@ CATCH_UP = 4  # steps at most that are made late; what is later is dropped
 STALLED = 10.0  # [s] without reading, then the visitor is shown out
 UNSEEN = 1.0  # [s] of frames on their way at most
 IDLE = 600.0  # [s] without a message
-FRAMES = 1500  # a second, of all visitors together
+FRAMES = 2000  # a second, of all visitors together
 SLOWEST = 6  # steps per frame at most
 
 
