@@ -155,6 +155,35 @@ def test_a_step_is_written_over_where_it_is_given_back() -> None:
     np.testing.assert_array_equal(first.position, kept)
 
 
+def test_a_push_changes_the_momentum_as_said_and_nobody_else() -> None:
+    """In the air, where gravity alone acts besides; over two threads and a block that is not full."""
+    agents, pushed, mass = 19, 17, 3
+    task = make_task("flat", gravity=0.0)
+    high = np.broadcast_to(task.position + [0.0, 40.0], (agents, 10, 2))
+    untouched, moved = Simulator(task, threads=2), Simulator(task, threads=2)
+    for simulator in (untouched, moved):
+        simulator.reset(agents, high)
+    change = np.zeros((agents, 10, 2))
+    change[pushed, mass] = [2.0, -0.5]
+    others = np.arange(agents) != pushed
+    for k, row in enumerate(commands(agents, 40)):
+        if k % 10 == 0:
+            moved.push(change)
+        before, seen = untouched.step(row), moved.step(row)
+        same(before, seen, others)
+        gained = (seen.velocity - before.velocity)[pushed].astype(np.float64).sum(axis=0)
+        np.testing.assert_allclose(gained, (k // 10 + 1) * change[pushed, mass], atol=1e-3)
+
+
+def test_a_push_of_nothing_leaves_every_bit() -> None:
+    simulator, plain = Simulator(make_task("hilly")), Simulator(make_task("hilly"))
+    for one in (simulator, plain):
+        one.reset(3)
+    for row in commands(3, 120):
+        simulator.push(np.zeros((3, 10, 2)))
+        same(simulator.step(row), plain.step(row))
+
+
 def test_solved_agents_start_again() -> None:
     simulator = Simulator(make_task("escape", cage_width=0.5))
     outside = simulator.task.position + [40.0, 0.0]
@@ -171,6 +200,13 @@ REFUSED = {
     "indices in place of bools": (lambda s: s.restart([0, 1]), "bools of shape [2]"),
     "scenes after a reset without": (lambda s: s.restart(np.ones(2, bool), scenes=[hills(0)] * 2), "reset with scenes"),
     "too few scenes": (lambda s: s.reset(2, scenes=[hills(0)]), "one for each of 2 agents; got 1"),
+    "a push before reset": (
+        lambda s: Simulator(s.task).push(np.zeros((2, 10, 2))),
+        "push: expected agents at the start",
+    ),
+    "a push of others": (lambda s: s.push(np.zeros((1, 10, 2))), "shape [2, 10, 2]; got shape [1, 10, 2]"),
+    "a push of NaN": (lambda s: s.push(np.full((2, 10, 2), np.nan)), "finite numbers of shape [2, 10, 2]; got NaN"),
+    "a push beyond float32": (lambda s: s.push(np.full((2, 10, 2), 1e39)), "NaN, infinity or too large"),
     "a step of others": (lambda s: s.step(np.zeros((2, 11)), out=Simulator(s.task).reset(3)), "these 2 agents"),
 }
 

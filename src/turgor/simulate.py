@@ -153,6 +153,22 @@ class Simulator:
         self._spread(run, self._stepping)
         return out
 
+    def push(self, change: ArrayLike) -> None:
+        """Adds `change` [m/s], shape [agent, mass, 2], to the velocities of the agents that `step` drives: the next
+        step starts from them. Masses whose change is 0 keep their bits. Raises `InvalidInput` for another shape, NaN
+        or infinity."""
+        if not self._stepping:
+            raise InvalidInput("push: expected agents at the start; call reset first")
+        shape = (self._stepping[-1][1].stop, self.task.body.mass_count, 2)
+        expected = f"change: expected finite numbers of shape {list(shape)}"
+        given = np.asarray(change, dtype=np.float64)
+        if given.shape != shape:
+            raise InvalidInput(expected, f"shape {list(given.shape)}")
+        if not (np.abs(given) <= np.finfo(np.float32).max).all():
+            raise InvalidInput(expected, "NaN, infinity or too large")
+        for batch, mine in self._stepping:
+            batch.push(given[mine].astype(np.float32))
+
     def restart(
         self,
         which: ArrayLike,

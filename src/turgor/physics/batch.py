@@ -141,6 +141,12 @@ class Batch:
                 self._grow(room_for(self._scenes, _SPARE))
         self.run(COMMANDS, 0, -1, fresh=fresh, **outputs)
 
+    def push(self, change: np.ndarray) -> None:
+        """Adds `change` [m/s], float32 [agent, mass, 2], to the velocities; what is 0 leaves the bits as they are."""
+        for agent, mass, axis in np.argwhere(change).tolist():
+            velocity = self.kernel.field(self.memory[agent // WIDTH], State, ("vx", "vy")[axis])
+            velocity[mass, agent % WIDTH] += change[agent, mass, axis]
+
     def look(self) -> tuple[np.ndarray, np.ndarray]:
         """Observations [agent, input] and stands [agent, stand] (see `Kernel.stand`), in arrays of their own."""
         observations, stands = self.kernel.rows_for(self.agents)

@@ -1,0 +1,632 @@
+"""The playground: sessions without sockets, visitors on real ones, and the page in a real browser."""
+
+import asyncio
+import contextlib
+import json
+import struct
+import threading
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import uvicorn
+import websockets
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import HTMLResponse
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+
+from turgor.errors import InvalidInput
+from turgor.web import playground
+from turgor.web.playground import Control, Drag, Playground, Session, Start, Wave, read
+
+STATIC = Path(playground.__file__).parent / "static"
+PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><link rel="icon" href="data:,">
+<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="stylesheet" href="static/play.css">
+<div id="here"></div><script type="module">
+import {start} from "./static/play.js";
+window.playing = start(document.getElementById("here"), "api/play");
+</script>"""
+
+
+# --- sessions -----------------------------------------------------------------------------------------------------
+
+
+def drive(session: Session, seconds: float) -> Session:
+    for _ in range(round(60 * seconds)):
+        session.step()
+    return session
+
+
+def area_ratio(session: Session) -> float:
+    return struct.unpack("<3f", session.frame()[:12])[2]
+
+
+@pytest.mark.parametrize("body", ["small", "medium", "large"])
+def test_the_pressure_is_what_it_is_told_half_a_second_later_and_moves_the_area(body: str) -> None:
+    session = drive(Session(Start(task="flat", body=body)), 2)
+    low, high = session.task.pressure_range[0]
+    areas = []
+    for share in (1.0, 0.0, 0.5):
+        session.tell(Control(share))
+        drive(session, 0.51)
+        np.testing.assert_allclose(session.stand.pressure[0, 0], low + share * (high - low), rtol=1e-5)
+        areas.append(area_ratio(drive(session, 1.5)))
+    assert areas[0] > 0.8
+    assert areas[1] < areas[0] - 0.2
+
+
+def test_an_agent_that_is_told_nothing_stays_as_it_is() -> None:
+    session = Session(Start(task="flat"))
+    pressure = session.stand.pressure[0, 0]
+    drive(session, 3)
+    assert session.stand.pressure[0, 0] == pytest.approx(pressure, rel=1e-5)
+    assert abs(session.com[0]) < 0.1
+
+
+@pytest.mark.parametrize("task", ["flat", "hilly"])
+def test_a_wave_moves_the_agent(task: str) -> None:
+    session = Session(Start(task=task))
+    session.tell(Control(0.5, Wave(amplitude=1.0, frequency=1.2, length=1.0, direction=-1)))
+    before = session.com[0]
+    assert abs(drive(session, 10).com[0] - before) > 0.5
+
+
+def test_the_wave_is_the_one_of_the_formula() -> None:
+    session = Session(Start(task="flat"))
+    session.tell(Control(0.5, Wave(amplitude=0.7, frequency=1.5, length=2.0, direction=1)))
+    drive(session, 0.5)
+    t, j = 29 / 60, np.arange(10)
+    expected = 0.7 * np.sin(2 * np.pi * (1.5 * t - 2 * j / 10))
+    np.testing.assert_allclose(session._commands[0, :10], expected, atol=1e-5)
+
+
+def test_a_hand_pulls_a_mass_where_it_points_and_carries_the_body() -> None:
+    for body in ("small", "large"):
+        session = drive(Session(Start(task="flat", body=body)), 1)
+        target = session.com + [5.0, 30.0]
+        session.drag(Drag(3, *target.tolist()))
+        drive(session, 4)
+        assert np.linalg.norm(session.stand.position[0, 3] - target) < 1.5
+        assert session.com[1] > 15
+        session.drag(None)
+        drive(session, 4)
+        assert session.com[1] < 12
+
+
+@pytest.mark.parametrize("far", [1e9, -1e300])
+def test_a_hand_is_strong_but_not_endless(far: float) -> None:
+    session = Session(Start(task="flat", gravity=0.0))
+    session.drag(Drag(0, far, far))
+    drive(session, 1)
+    assert np.isfinite(session.stand.stand).all()
+    momentum = session._share @ session.stand.velocity[0].astype(np.float64)
+    assert np.linalg.norm(momentum) <= playground.HAND_STRENGTH * 1.01
+    with pytest.raises(InvalidInput, match="mass: expected 0 to 9; got 10"):
+        session.drag(Drag(10, 0.0, 0.0))
+
+
+def test_the_same_messages_at_the_same_steps_give_the_same_bits() -> None:
+    def story() -> list[bytes]:
+        session, frames = Session(Start(task="hilly", seed=3, gravity=7.0, frequency=6.0)), []
+        random = np.random.default_rng(5)
+        for k in range(600):
+            if k % 40 == 0:
+                wave = Wave(*random.uniform(0, 1, 3).tolist(), direction=int(random.choice([-1, 1])))
+                session.tell(Control(float(random.uniform()), wave))
+            if k % 90 == 10:
+                session.drag(Drag(int(random.integers(10)), *(session.com + random.uniform(-9, 9, 2)).tolist()))
+            if k % 90 == 60:
+                session.drag(None)
+            if k == 400:
+                session.restart()
+            session.step()
+            frames.append(session.frame())
+        return frames
+
+    assert story() == story()
+
+
+def test_a_session_without_a_hand_is_the_same_bits_as_the_simulator() -> None:
+    session = Session(Start(task="hilly", body="medium", seed=1))
+    session.tell(Control(0.3, Wave(0.8, 1.0, 1.0, 1)))
+    simulator, seen = playground.Simulator(session.task, threads=2), None
+    simulator.reset(20)
+    for _ in range(100):
+        session.step()
+        seen = simulator.step(np.repeat(session._commands, 20, axis=0))
+    assert seen is not None
+    assert seen.position[7].tobytes() == session.stand.position[0].tobytes()
+
+
+def test_numbers_beyond_what_is_possible_are_cut() -> None:
+    session = Session(Start(task="flat", gravity=1e9, frequency=-3.0))
+    assert (session.start.gravity, session.start.frequency) == (30.0, 1.0)
+    session.tell(Control(-5.0, Wave(9.0, 1e300, -1.0, 1)))
+    assert session.control == Control(0.0, Wave(1.0, 4.0, 0.0, 1))
+    drive(session, 2)
+    assert np.isfinite(session.stand.stand).all()
+
+
+def test_an_agent_that_fell_off_the_world_is_lost() -> None:
+    session = Session(Start(task="flat"))
+    assert not session.lost
+    session.stand.position[0, :, 1] -= 200
+    assert session.lost
+    session.stand.position[:] = np.nan
+    assert session.lost
+
+
+def test_a_scene_tells_all_that_a_page_needs() -> None:
+    scene = json.loads(Session(Start(task="escape", body="large")).scene())
+    assert (scene["type"], scene["masses"], len(scene["springs"]), scene["end"]) == ("scene", 20, 20, 16.0)
+    assert len(scene["scene"]["segments"]) == len(scene["scene"]["depth"]) == 9
+    assert scene["start"] == {
+        "type": "start", "task": "escape", "body": "large", "seed": 0, "gravity": 10.0, "frequency": 8.0,
+    }  # fmt: skip
+    assert len(Session(Start(body="large")).frame()) == 4 * (3 + 40) + 20
+
+
+MALFORMED = [
+    "", "nonsense", "[]", "1", "null", "{}", '{"type":"x"}', '{"type":5}',
+    '{"type":"pause"}', '{"type":"pause","on":1}',
+    '{"type":"reset","more":1}', '{"type":"control"}', '{"type":"control","pressure":"high"}',
+    '{"type":"control","pressure":NaN}', '{"type":"control","pressure":1e999}', '{"type":"control","pressure":null}',
+    '{"type":"control","pressure":0.5,"wave":{"direction":0}}', '{"type":"control","pressure":0.5,"wave":[1]}',
+    '{"type":"start","task":"moon"}', '{"type":"start","seed":-1}', '{"type":"start","seed":1.5}',
+    '{"type":"start","seed":%s}' % ("9" * 300), '{"type":"start","body":"huge"}', '{"type":"drag","mass":0,"x":0}',
+    '{"type":"drag","mass":-1,"x":0,"y":0}', '{"type":"drag","mass":99999999999999999999,"x":0,"y":0}',
+    "[" * 4000, '{"a":' * 700, " " * 5000, '{"type":"pause","on":true}' + " " * 4096, "\x00", "\ud800", "💥" * 50,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", MALFORMED, ids=range(len(MALFORMED)))
+def test_what_is_no_message_is_refused_in_one_line(text: str) -> None:
+    def take() -> None:
+        message = read({"type": "websocket.receive", "text": text})
+        Session(message) if isinstance(message, Start) else Session(Start()).drag(message)
+
+    with pytest.raises(InvalidInput) as error:
+        take()
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 150
+
+
+# --- visitors -----------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def served(ground: Playground) -> Iterator[str]:
+    """The playground and a page, served by a thread; yields host and port."""
+    app = Starlette(
+        routes=[
+            Route("/", page),
+            WebSocketRoute("/api/play", ground.play),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ]
+    )
+    config = uvicorn.Config(
+        app, host="127.0.0.1", port=0, log_level="critical", ws="websockets-sansio", ws_per_message_deflate=False,
+        timeout_graceful_shutdown=1,
+    )  # fmt: skip
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+        assert thread.is_alive()
+    try:
+        yield f"127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join(10)
+
+
+async def page(request: Request) -> HTMLResponse:
+    return HTMLResponse(PAGE)
+
+
+@pytest.fixture(scope="module")
+def ground() -> Playground:
+    Session(Start())  # the engine is compiled
+    return Playground()
+
+
+@pytest.fixture(scope="module")
+def host(ground: Playground) -> Iterator[str]:
+    with served(ground) as place:
+        yield place
+
+
+class Client:
+    """A browser without a page."""
+
+    def __init__(self, socket: Any) -> None:
+        self.socket = socket
+        self.frames: list[tuple[float, bytes]] = []  # when, what
+        self.texts: list[dict[str, Any]] = []
+        self._seen = 0.0
+
+    async def say(self, kind: str, **fields: Any) -> None:
+        await self.socket.send(json.dumps({"type": kind, **fields}))
+
+    async def hear(self) -> None:
+        """Takes one message."""
+        data = await asyncio.wait_for(self.socket.recv(), 15)
+        if isinstance(data, str):
+            self.texts.append(json.loads(data))
+            return
+        self.frames.append((time.monotonic(), data))
+        if time.monotonic() - self._seen > 0.2:
+            self._seen = time.monotonic()
+            await self.say("seen")
+
+    async def hear_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self.hear(), max(end - time.monotonic(), 0.001))
+
+    async def hear_until(self, done: Callable[[], bool]) -> None:
+        while not done():
+            await self.hear()
+
+    def numbers(self, k: int = -1) -> np.ndarray:
+        data = self.frames[k][1]
+        masses = (len(data) - 12) // 9
+        return np.frombuffer(data[: 12 + 8 * masses], "<f4")
+
+
+def visit(host: str, story: Callable[[Client], Awaitable[None]], **options: Any) -> Client:
+    async def whole() -> Client:
+        async with websockets.connect(f"ws://{host}/api/play", compression=None, **options) as socket:
+            client = Client(socket)
+            await story(client)
+            return client
+
+    return asyncio.run(whole())
+
+
+def test_a_visitor_sees_the_agent_in_real_time(host: str, ground: Playground) -> None:
+    async def story(client: Client) -> None:
+        await client.say("start", task="flat", body="medium")
+        await client.hear_for(2.5)
+
+    client = visit(host, story)
+    assert client.texts[0]["type"] == "scene"
+    times = [struct.unpack("<f", frame[:4])[0] for _, frame in client.frames]
+    assert times == sorted(times)
+    assert 100 < len(times) <= 155
+    assert {len(frame) for _, frame in client.frames} == {4 * (3 + 30) + 15}
+    assert times[-1] == pytest.approx(client.frames[-1][0] - client.frames[0][0], abs=0.15)
+    assert not [text for text in client.texts if text["type"] == "error"]
+
+
+def test_pressure_drag_pause_and_reset_over_the_socket(host: str) -> None:
+    async def story(client: Client) -> None:
+        await client.say("start", task="flat", body="small")
+        await client.say("control", pressure=1.0)
+        await client.hear_for(1.0)
+        full = client.numbers()[2]
+        await client.say("control", pressure=0.0, wave={"amplitude": 0, "frequency": 1, "length": 1, "direction": 1})
+        await client.hear_for(1.2)
+        assert client.numbers()[2] < full - 0.2
+        await client.say("drag", mass=2, x=10.0, y=25.0)
+        await client.hear_for(1.5)
+        assert client.numbers()[3 + 2 * 2 + 1] > 15
+        await client.say("drop")
+        await client.say("pause", on=True)
+        await client.hear_for(0.3)
+        shown = len(client.frames)
+        await client.hear_for(0.4)
+        assert len(client.frames) == shown
+        await client.say("reset")
+        await client.hear_until(lambda: client.numbers()[0] == 0.0)
+        await client.say("pause", on=False)
+        await client.hear_until(lambda: client.numbers()[0] > 0.2)
+        await client.say("start", task="escape", body="large", seed=4)
+        await client.hear_until(lambda: sum(text["type"] == "scene" for text in client.texts) == 2)
+
+    visit(host, story)
+
+
+def test_a_bad_message_is_answered_and_the_visit_goes_on(host: str) -> None:
+    async def story(client: Client) -> None:
+        await client.say("reset")
+        await client.say("start", task="flat")
+        await client.socket.send("nonsense")
+        await client.socket.send(b"\x00\x01")
+        await client.say("drag", mass=10, x=0, y=0)
+        await client.hear_for(0.6)
+        errors = [text["message"] for text in client.texts if text["type"] == "error"]
+        for error, expected in zip(errors, ("a start first", "JSON is malformed", "JSON text", "0 to 9"), strict=True):
+            assert expected in error
+        assert client.numbers()[0] > 0.1
+
+    visit(host, story)
+
+
+def test_a_thousand_malformed_messages_end_one_visit_and_nobody_elses(host: str, ground: Playground) -> None:
+    async def story() -> None:
+        url = f"ws://{host}/api/play"
+        async with websockets.connect(url, compression=None) as good, contextlib.AsyncExitStack() as stack:
+            client = Client(good)
+            await client.say("start", task="flat")
+            await client.hear_for(0.5)
+            sent = 0
+            while sent < 1000:
+                bad = await stack.enter_async_context(websockets.connect(url, compression=None))
+                with contextlib.suppress(websockets.ConnectionClosed):
+                    for text in MALFORMED * 4:
+                        if text != "\ud800":
+                            sent += 1
+                            await bad.send(text)
+                    while True:
+                        await asyncio.wait_for(bad.recv(), 5)
+                assert (bad.close_code, bad.close_reason) == (1008, "more than 50 bad messages")
+            before = len(client.frames)
+            await client.hear_for(1.0)
+            assert len(client.frames) > before + 30
+
+    asyncio.run(story())
+    assert wait_for(lambda: ground.visitors == 0)
+
+
+def test_too_many_messages_are_too_many(host: str) -> None:
+    async def story(client: Client) -> None:
+        await client.say("start", task="flat")
+        with contextlib.suppress(websockets.ConnectionClosed):
+            for _ in range(3000):
+                await client.say("control", pressure=0.5)
+        with contextlib.suppress(websockets.ConnectionClosed):
+            while True:
+                client.texts.append(json.loads(data) if isinstance(data := await client.socket.recv(), str) else {})
+        assert client.socket.close_code == 1008
+        assert any("at most 240 a second" in text.get("message", "") for text in client.texts)
+
+    visit(host, story)
+
+
+def test_a_visitor_who_stops_reading_is_shown_out(
+    host: str, ground: Playground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(playground, "STALLED", 2.0)
+
+    async def story() -> None:
+        url = f"ws://{host}/api/play"
+        silent = await websockets.connect(url, compression=None, max_queue=1, ping_interval=None)
+        reading = await websockets.connect(url, compression=None)
+        client = Client(reading)
+        await silent.send('{"type":"start","task":"flat"}')
+        await client.say("start", task="flat")
+        await client.hear_for(3.5)  # the silent one's socket is not read from
+        count = 0
+        with contextlib.suppress(websockets.ConnectionClosed):
+            while True:
+                data = await asyncio.wait_for(silent.recv(), 5)
+                count += isinstance(data, bytes)
+        assert silent.close_code == 1008
+        assert count <= 62  # a second's, and the first
+        before = len(client.frames)
+        await client.hear_for(0.5)
+        assert len(client.frames) > before + 15
+        await reading.close()
+
+    asyncio.run(story())
+    assert wait_for(lambda: ground.visitors == 0)
+
+
+def test_a_visitor_who_says_nothing_is_paused(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(playground, "IDLE", 0.5)
+
+    async def story(client: Client) -> None:
+        await client.say("start", task="flat")
+        await client.hear_until(lambda: "paused" in client.texts[-1].get("message", "") if client.texts else False)
+        shown = len(client.frames)
+        await client.hear_for(0.4)
+        assert len(client.frames) == shown
+        await client.say("control", pressure=0.5)
+        await client.hear_for(0.3)
+        assert len(client.frames) > shown
+
+    visit(host, story)
+
+
+def test_a_playground_that_is_full_says_so() -> None:
+    async def story(host: str) -> None:
+        url = f"ws://{host}/api/play"
+        async with websockets.connect(url), websockets.connect(url) as second:
+            assert "full: 1 visitors" in json.loads(await second.recv())["message"]
+            with pytest.raises(websockets.ConnectionClosed):
+                await second.recv()
+            assert second.close_code == 1013
+
+    with served(Playground(most=1)) as host:
+        asyncio.run(story(host))
+
+
+def test_two_hundred_visitors_at_once(host: str, ground: Playground) -> None:
+    """Each with an agent of their own: every one gets frames, and the server still answers. How fast is for the
+    benchmark: here only that nobody starves."""
+    visitors, seconds = 200, 3.0
+
+    async def one(k: int, ready: Barrier) -> Client:
+        async with websockets.connect(f"ws://{host}/api/play", compression=None, open_timeout=30) as socket:
+            client = Client(socket)
+            await client.say("start", task="flat", body=["small", "medium", "large"][k % 3])
+            await client.say("control", pressure=(k % 10) / 10)
+            await client.hear_until(lambda: len(client.frames) > 1)
+            await ready.wait()
+            client.frames.clear()
+            await client.hear_for(seconds)
+            return client
+
+    async def all_of_them() -> list[Client]:
+        ready = Barrier(visitors)
+        return await asyncio.gather(*(one(k, ready) for k in range(visitors)))
+
+    clients = asyncio.run(all_of_them())
+    frames = [len(client.frames) for client in clients]
+    spans = [float(client.numbers()[0] - client.numbers(0)[0]) for client in clients]
+    gaps = [max(np.diff([at for at, _ in client.frames])) for client in clients]
+    print(f"frames/s {min(frames) / seconds:.1f} to {max(frames) / seconds:.1f}, simulated {min(spans):.2f} s")
+    assert min(frames) > 3 * seconds
+    assert min(spans) > 0.3 * seconds
+    assert max(gaps) < 2.0
+    assert any("rate" in text and text["rate"] < 60 for text in clients[0].texts)
+    assert wait_for(lambda: ground.visitors == 0)
+
+
+class Barrier:
+    """asyncio.Barrier in a line: waits until all have come."""
+
+    def __init__(self, count: int) -> None:
+        self.missing, self.all_here = count, asyncio.Event()
+
+    async def wait(self) -> None:
+        self.missing -= 1
+        if self.missing == 0:
+            self.all_here.set()
+        await self.all_here.wait()
+
+
+def wait_for(true: Callable[[], bool], seconds: float = 8.0) -> bool:
+    end = time.monotonic() + seconds
+    while not true() and time.monotonic() < end:
+        time.sleep(0.05)
+    return true()
+
+
+# --- the page in a browser ----------------------------------------------------------------------------------------
+
+LATER = "parseFloat(document.querySelector('[data-play=read-time]')?.textContent) > 0.5"
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="the browser's tests need playwright")
+    with sync_api.sync_playwright() as tool:
+        options = {"executable_path": CHROMIUM} if Path(CHROMIUM).exists() else {}
+        try:
+            chromium = tool.chromium.launch(args=ARGUMENTS, **options)
+        except sync_api.Error:
+            pytest.skip("the browser's tests need Chromium")
+        yield chromium
+        chromium.close()
+
+
+@contextlib.contextmanager
+def opened(browser: Any, host: str, **options: Any) -> Iterator[Any]:
+    """The page, without a word on its console."""
+    context = browser.new_context(**options)
+    tab, wrong = context.new_page(), []
+    tab.on("pageerror", lambda error: wrong.append(str(error)))
+    tab.on("console", lambda message: wrong.append(message.text))
+    tab.set_default_timeout(10_000)
+    tab.goto(f"http://{host}/")
+    tab.wait_for_function(LATER)
+    yield tab
+    context.close()
+    assert wrong == []
+
+
+def reading(tab: Any, name: str) -> float:
+    return float(tab.locator(f"[data-play=read-{name}]").inner_text().split()[0].replace("−", "-"))
+
+
+def test_the_pressure_slider_down_makes_the_area_smaller(browser: Any, host: str) -> None:
+    with opened(browser, host, viewport={"width": 1200, "height": 800}) as tab:
+        tab.click("[data-value=flat]")
+        slider = tab.get_by_label("Pressure", exact=True)
+        slider.fill("1")
+        tab.wait_for_timeout(1200)
+        full, pressure = reading(tab, "area"), reading(tab, "pressure")
+        slider.fill("0")
+        tab.wait_for_timeout(1500)
+        assert reading(tab, "pressure") == pytest.approx(0.2 * pressure, rel=0.02)
+        assert reading(tab, "area") < full - 0.15
+        painted = tab.evaluate(
+            """() => { const c = document.querySelector("canvas"), g = c.getContext("2d");
+            return new Set(new Uint32Array(g.getImageData(0, 0, c.width, c.height).data.buffer)).size }"""
+        )
+        assert painted > 50
+
+
+def test_keys_drive_pause_and_reset(browser: Any, host: str) -> None:
+    with opened(browser, host, viewport={"width": 1200, "height": 800}) as tab:
+        tab.click("[data-value=flat]")
+        for _ in range(10):
+            tab.keyboard.press("ArrowRight")
+        for _ in range(8):
+            tab.keyboard.press("ArrowDown")
+        tab.wait_for_timeout(2500)
+        assert abs(reading(tab, "distance")) + abs(reading(tab, "speed")) > 0.1
+        assert tab.locator("[data-play=amplitude]").input_value() == "1"
+        assert tab.locator("[data-value='-1']").get_attribute("aria-pressed") == "true"
+        tab.keyboard.press("Space")
+        tab.wait_for_timeout(300)
+        held = reading(tab, "time")
+        tab.wait_for_timeout(300)
+        assert reading(tab, "time") == held
+        assert tab.locator("[data-play=pause]").inner_text() == "Resume"
+        tab.keyboard.press("Space")
+        tab.keyboard.press("r")
+        tab.wait_for_timeout(300)
+        assert reading(tab, "time") < held
+        for _ in range(20):
+            tab.keyboard.press("ArrowLeft")
+        assert tab.locator("[data-value='1']").get_attribute("aria-pressed") == "true"
+
+
+def test_the_pointer_drags_the_nearest_mass(browser: Any, host: str) -> None:
+    with opened(browser, host, viewport={"width": 1200, "height": 800}) as tab:
+        tab.click("[data-value=flat]")
+        tab.wait_for_timeout(1200)
+        before, box = reading(tab, "distance"), tab.locator("canvas").bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + 0.6 * box["height"]
+        tab.mouse.move(x + 60, y)
+        tab.mouse.down()
+        tab.mouse.move(x + 330, y - 60, steps=8)
+        tab.wait_for_timeout(1200)
+        tab.mouse.up()
+        assert reading(tab, "distance") > before + 3
+
+
+def test_a_page_on_a_telephone(browser: Any, host: str) -> None:
+    with opened(browser, host, viewport={"width": 360, "height": 740}, has_touch=True) as tab:
+        assert tab.evaluate("document.documentElement.scrollWidth") <= 360
+        unnamed = """() => [...document.querySelectorAll("input, button, canvas")].filter(
+            (e) => !(e.getAttribute("aria-label") || e.textContent.trim())).map((e) => e.outerHTML)"""
+        unnamed = tab.evaluate(unnamed)
+        assert [tag for tag in unnamed if "reconnect" not in tag] == []
+        tab.tap("[data-value=large]")
+        tab.tap("[data-value=escape]")
+        tab.wait_for_function("document.querySelector('[data-play=terrain]').disabled")
+        tab.evaluate("playing.stop()")
+        assert tab.locator("canvas").count() == 0
+
+
+def test_a_closed_connection_can_be_opened_again(browser: Any, host: str) -> None:
+    script = """const Real = WebSocket; window.sockets = [];
+        window.WebSocket = class extends Real { constructor(...a) { super(...a); sockets.push(this); } };"""
+    context = browser.new_context(viewport={"width": 800, "height": 700})
+    tab = context.new_page()
+    tab.add_init_script(script)
+    tab.set_default_timeout(10_000)
+    tab.goto(f"http://{host}/")
+    tab.wait_for_function(LATER)
+    tab.evaluate("sockets.at(-1).close()")
+    tab.get_by_role("button", name="Reconnect").click()
+    tab.wait_for_function("sockets.length === 2")
+    tab.wait_for_function(LATER)
+    assert tab.locator("[data-play=closed]").is_hidden()
+    context.close()
