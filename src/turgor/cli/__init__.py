@@ -10,6 +10,7 @@ from turgor.cli.champion import EVALUATE, VIDEO
 from turgor.cli.command import Command, Interrupted, Parser, did_you_mean
 from turgor.cli.evolve import EVOLVE, RESUME
 from turgor.cli.reproduce import REPRODUCE
+from turgor.cli.view import VIEW
 from turgor.cli.words import say
 from turgor.errors import InvalidInput
 
@@ -20,6 +21,7 @@ COMMANDS: dict[str, Command] = {
     "resume": RESUME,
     "evaluate": EVALUATE,
     "video": VIDEO,
+    "view": VIEW,
     "reproduce": REPRODUCE,
     "bench": BENCH,
 }
