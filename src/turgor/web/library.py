@@ -483,6 +483,7 @@ def _facts(run: Run) -> dict[str, Any]:
         "chambers": task.body.chamber_count,
         "parameters": task.parameter_count,
         "duration": task.duration,
+        "dt": task.physics.dt,
         "fitness": task.fitness,
         "gravity": task.physics.gravity,
         "window": task.sensing.window,
