@@ -210,7 +210,7 @@ class Library:
                 if not _printable(name):
                     problems[describe(ascii(below))] = "expected a name in UTF-8"
                 elif entry.is_symlink():
-                    if not os.path.realpath(entry.path).startswith(f"{self.folder}{os.sep}"):
+                    if not Path(os.path.realpath(entry.path)).is_relative_to(self.folder):
                         problems[below] = "a link that leads out of the folder is not followed"
                 elif depth < DEPTH and not name.startswith(".") and entry.is_dir(follow_symlinks=False):
                     waiting.append((below, depth + 1))

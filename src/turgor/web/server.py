@@ -62,9 +62,9 @@ def make_app(library: Library, *, host: str, port: int, token: str | None) -> tu
         return _json(await asyncio.to_thread(library.details, _path(library, request)))
 
     async def replay(request: Request) -> Response:
-        which = request.query_params.get("which", "champion")
-        if which not in ("champion", "solver"):
-            raise Refused(400, f"which: expected champion or solver; got {describe(which)}")
+        which = request.query_params.get("which", "best")
+        if which not in ("best", "solver"):
+            raise Refused(400, f"which: expected best or solver; got {describe(which)}")
         data = await replays.get(_path(library, request), which)
         return Response(data, media_type="application/octet-stream", headers={"cache-control": "no-cache"})
 
@@ -180,7 +180,8 @@ class Hub:
         for event in events:
             message = f"event: {event.kind}\ndata: ".encode() + msgspec.json.encode(event.data) + b"\n\n"
             for client in list(self.clients):
-                client.tell(message)
+                if not client.tell(message):
+                    self.clients.discard(client)
 
     def close(self) -> None:
         """Sends every client away."""
@@ -195,12 +196,13 @@ class Client:
         self.messages: asyncio.Queue[bytes | None] = asyncio.Queue(QUEUE)  # None: the end
         self.dropped = False
 
-    def tell(self, message: bytes) -> None:
-        """Has `message` sent; drops a client for which too many wait."""
+    def tell(self, message: bytes) -> bool:
+        """Has `message` sent; drops a client for which too many wait, and returns False."""
         try:
             self.messages.put_nowait(message)
         except asyncio.QueueFull:
             self.drop()
+        return not self.dropped
 
     def drop(self) -> None:
         """Ends it, whatever waits."""
@@ -310,8 +312,20 @@ def _mark(path: Path, largest: int) -> tuple[int, int] | None:
 class Server(uvicorn.Server):
     """Calls `ready` once it serves, and sends its listeners away before it waits for connections to end."""
 
-    def __init__(self, config: uvicorn.Config, hub: Hub, ready: Callable[[], None]) -> None:
-        super().__init__(config)
+    def __init__(self, app: Starlette, hub: Hub, ready: Callable[[], None]) -> None:
+        super().__init__(
+            uvicorn.Config(
+                app,
+                log_level="critical",
+                access_log=False,
+                server_header=False,
+                ws="websockets-sansio",
+                ws_max_size=MESSAGE_BYTES,
+                limit_concurrency=2 * MOST_CLIENTS,
+                timeout_graceful_shutdown=2,
+                lifespan="on",
+            )
+        )
         self._hub, self._ready = hub, ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -341,17 +355,6 @@ def serve(
     port = listener.getsockname()[1]
     app, hub = make_app(Library(folder), host=host, port=port, token=token)
     page = address(host, port, token)
-    config = uvicorn.Config(
-        app,
-        log_level="critical",
-        access_log=False,
-        server_header=False,
-        ws="websockets-sansio",
-        ws_max_size=MESSAGE_BYTES,
-        limit_concurrency=2 * MOST_CLIENTS,
-        timeout_graceful_shutdown=2,
-        lifespan="on",
-    )
 
     def ready() -> None:
         say(f"serving {folder} at {page}")
@@ -360,7 +363,7 @@ def serve(
             open_page(page)
 
     with listener:
-        server = Server(config, hub, ready)
+        server = Server(app, hub, ready)
         server.run(sockets=[listener])
     if not server.started:
         raise InvalidInput(f"{folder}: expected a folder that can be served")

@@ -1,6 +1,6 @@
 // The page's frame: which view is shown, and what the server tells while it is.
 
-import { ask, failure, h } from "./elements.js";
+import { ask, failure, h, style } from "./elements.js";
 import { show as campaign } from "./campaign.js";
 import { show as compare } from "./compare.js";
 import { show as library } from "./library.js";
@@ -112,19 +112,20 @@ async function route() {
 
 /** The playground, whose code is loaded when it is first wanted. */
 function play(element) {
-  let end = null, over = false;
+  let player = null, over = false;
+  style("static/play.css");
   document.title = "playground · turgor";
   const url = new URL("api/play", document.baseURI);
   url.protocol = url.protocol.replace("http", "ws");
   url.hash = "";
   import("./play.js")
     .then(({ start }) => {
-      if (!over) end = start(element, url.href);
+      if (!over) player = start(element, url.href);
     })
     .catch((error) => element.append(failure(`The playground cannot be shown: ${error.message}`)));
   return () => {
     over = true;
-    typeof end === "function" ? end() : end?.stop?.();
+    player?.stop();
   };
 }
 

@@ -48,7 +48,7 @@ export function show(element, store, a = "", b = "") {
       h("section", { class: "card" }, h("h2", {}, "Champions"), film),
     );
     curves = new Curves(plot, histories, { unit: runs[0].unit, names: ["A", "B"] });
-    if (runs.every((run) => run.champion)) endFilm = showReplays(film, paths.map((path) => ({ path, which: "champion" })));
+    if (runs.every((run) => run.champion)) endFilm = showReplays(film, paths.map((path) => ({ path, which: "best" })));
     else film.append(h("p", { class: "muted" }, "One of them has no champion yet."));
   }
 

@@ -78,6 +78,12 @@ export async function ask(kind, path = null, query = "") {
     : response.arrayBuffer();
 }
 
+/** Loads a style sheet that only some views need. */
+export function style(href) {
+  if (document.querySelector(`link[href="${href}"]`)) return;
+  document.head.append(h("link", { rel: "stylesheet", href }));
+}
+
 /** A clear message in the place of what could not be shown. */
 export function failure(message) {
   return h("p", { class: "failure", role: "alert" }, message);

@@ -1,6 +1,6 @@
 // The player, whose code is loaded when there is something to play.
 
-import { ask, failure, h } from "./elements.js";
+import { ask, failure, h, style } from "./elements.js";
 
 /** Plays the replays of `wanted`, each {path, which}, in `element`; returns what ends it. */
 export function showReplays(element, wanted) {
@@ -21,7 +21,7 @@ export function showReplays(element, wanted) {
   play().catch((error) => over || element.replaceChildren(failure(`It cannot be played: ${error.message}`)));
   return () => {
     over = true;
-    (player?.destroy ?? player?.stop ?? player?.end)?.call(player);
+    player?.destroy();
   };
 }
 
@@ -32,9 +32,4 @@ async function code(module) {
   } catch {
     throw new Error(`the page's part ${module.slice(2)} is missing.`);
   }
-}
-
-function style(href) {
-  if (document.querySelector(`link[href="${href}"]`)) return;
-  document.head.append(h("link", { rel: "stylesheet", href }));
 }

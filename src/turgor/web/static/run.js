@@ -52,7 +52,7 @@ export function show(element, store, path = "") {
     const solved = champion?.solved ?? null;
     tiles.replaceChildren(...[
       ["fitness", number(run.fitness, 3) + unit, champion ? `found in generation ${count(champion.generation)}` : ""],
-      ["robust", number(run.robust, 3) + (run.robust === null ? "" : unit), run.robust === null ? "measured at the end" : "median of moved starts"],
+      ["robust", number(run.robust, 3) + (run.robust === null ? "" : unit), run.robust !== null ? "median of moved starts" : run.status === "running" ? "measured at the end" : "not measured"],
       solved === null ? null : ["task", solved ? "solved" : "not solved", solved ? `in ${number(champion.steps * details.task.dt, 1)} s` : ""],
       ["evaluations", count(run.evaluations), `of ${count(run.budget)}, generation ${count(run.generation)}`],
       ["step size σ", number(run.sigma, 4), run.strategy],
@@ -75,7 +75,7 @@ export function show(element, store, path = "") {
     const other = solver !== null && solver !== fitness;
     film.replaceChildren(
       other ? h("div", { class: "choice", role: "group", "aria-label": "Which agent" },
-        pick("champion", "Best fitness", true), pick("solver", "Best that solves the task", false)) : "",
+        pick("best", "Best fitness", true), pick("solver", "Best that solves the task", false)) : "",
       stage,
     );
     function pick(which, text, on) {
@@ -84,7 +84,7 @@ export function show(element, store, path = "") {
         play(which);
       } }, text);
     }
-    play("champion");
+    play("best");
   }
 
   function drawFacts() {
