@@ -102,7 +102,8 @@ def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys; from turgor.cli import main, COMMANDS\n"
         "for argv in [['--help'], *([name, '--help'] for name in COMMANDS)]: main(argv)\n"
-        "heavy = {'numpy', 'numba', 'matplotlib', 'scipy', 'cma', 'pygame', 'av', 'rich', 'tyro'} & set(sys.modules)\n"
+        "heavy = {'numpy', 'numba', 'matplotlib', 'scipy', 'cma', 'pygame', 'av', 'rich', 'tyro',\n"
+        "         'starlette', 'uvicorn', 'websockets'} & set(sys.modules)\n"
         "sys.exit(' '.join(heavy) or 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -11,6 +11,7 @@ from turgor.cli.command import Command, Interrupted, Parser, did_you_mean
 from turgor.cli.evolve import EVOLVE, RESUME
 from turgor.cli.export import EXPORT
 from turgor.cli.reproduce import REPRODUCE
+from turgor.cli.view import VIEW
 from turgor.cli.words import say
 from turgor.errors import InvalidInput
 
@@ -21,6 +22,7 @@ COMMANDS: dict[str, Command] = {
     "resume": RESUME,
     "evaluate": EVALUATE,
     "video": VIDEO,
+    "view": VIEW,
     "export": EXPORT,
     "reproduce": REPRODUCE,
     "bench": BENCH,
