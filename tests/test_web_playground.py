@@ -436,6 +436,30 @@ def test_a_visitor_who_says_nothing_is_paused(host: str, monkeypatch: pytest.Mon
     visit(host, story)
 
 
+def test_a_visitor_without_an_agent_makes_room(host: str, ground: Playground, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(playground, "ABSENT", 0.3)
+
+    async def story(client: Client) -> None:
+        with pytest.raises(websockets.ConnectionClosed):
+            await client.hear()
+        assert client.socket.close_code == 1001
+
+    visit(host, story)
+    assert wait_for(lambda: ground.visitors == 0)
+
+
+def test_an_agent_that_left_the_world_starts_again(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Session, "lost", property(lambda session: session.steps > 30))
+
+    async def story(client: Client) -> None:
+        await client.say("start", task="flat")
+        await client.hear_for(1.3)
+        assert client.numbers()[0] < 0.6
+        assert any("left the world" in text.get("message", "") for text in client.texts)
+
+    visit(host, story)
+
+
 def test_a_playground_that_is_full_says_so() -> None:
     async def story(host: str) -> None:
         url = f"ws://{host}/api/play"

@@ -42,7 +42,8 @@ START_PAUSE = 0.25  # [s] between two starts
 CATCH_UP = 4  # steps at most that are made late; what is later is dropped
 STALLED = 10.0  # [s] without reading, then the visitor is shown out
 UNSEEN = 1.0  # [s] of frames on their way at most
-IDLE = 600.0  # [s] without a message
+IDLE = 600.0  # [s] without a message, then the agent stands still
+ABSENT = 3600.0  # [s] without an agent that moves, then the visitor makes room for others
 FRAMES = 2000  # a second, of all visitors together
 SLOWEST = 6  # steps per frame at most
 
@@ -223,7 +224,7 @@ class Session:
         change = (v - h * k * C) / (1 + h * c + h * h * k) - v
         change *= min(1.0, h * HAND_STRENGTH * whole / max(math.hypot(*change), 1e-9))
         out = np.zeros((1, body.mass_count, 2))
-        out[0, i] = change
+        out[0, i] = np.nan_to_num(change, posinf=0, neginf=0)  # an agent that is lost needs no hand
         return out
 
     def frame(self) -> bytes:
@@ -312,7 +313,7 @@ class Playground:
         for end in ends:
             if isinstance(end, Farewell):
                 await visitor.leave(end)
-            elif isinstance(end, Exception) and not isinstance(end, WebSocketDisconnect | OSError | RuntimeError):
+            elif isinstance(end, Exception) and not isinstance(end, WebSocketDisconnect):
                 raise end
 
 
@@ -394,8 +395,7 @@ class Visitor:
             if self.session is None or self.paused or self._idle:
                 if self.session is not None and self._idle and not self.paused:
                     await self._send(_status(f"paused: nothing heard for {IDLE / 60:g} minutes", stride))
-                self._said.clear()
-                await self._said.wait()
+                await self._wait()
                 due, self._seen = self._now(), self._now()
                 continue
             if stride != self.playground.stride:
@@ -403,11 +403,20 @@ class Visitor:
                 await self._send(_status("", stride))
             due = await self._keep_time(due, stride)
             if self._now() - self._seen > STALLED:
-                raise Farewell(1008, "nothing seen for 10 seconds")
+                raise Farewell(1008, f"nothing seen for {STALLED:g} seconds")
             if self._unseen * stride < UNSEEN * 60:
                 async with self._sending:
                     self._unseen += 1
                     await self._give(self.session.frame())
+
+    async def _wait(self) -> None:
+        """Waits for a message that may set the agent going."""
+        self._said.clear()
+        try:
+            async with asyncio.timeout(ABSENT):
+                await self._said.wait()
+        except TimeoutError:
+            raise Farewell(1001, f"nothing happened for {ABSENT / 60:g} minutes") from None
 
     async def _keep_time(self, due: float, stride: int) -> float:
         """Makes `stride` steps at the time `due`, and more if it is late; returns when the next are due."""
@@ -442,7 +451,9 @@ class Visitor:
                 else:
                     await self.websocket.send_bytes(what)
         except TimeoutError:
-            raise Farewell(1008, "nothing read for 10 seconds") from None
+            raise Farewell(1008, f"nothing read for {STALLED:g} seconds") from None
+        except (OSError, RuntimeError):  # a closed socket, as Starlette tells it
+            raise WebSocketDisconnect(1006) from None
 
     async def leave(self, farewell: Farewell) -> None:
         """Says goodbye, without waiting long for an answer."""
