@@ -138,13 +138,13 @@ def visit(host: str, story: Callable[[Client], Awaitable[None]], **options: Any)
 def test_a_visitor_sees_the_agent_in_real_time(host: str, ground: Playground) -> None:
     async def story(client: Client) -> None:
         await client.say("start", task="flat", body="medium")
-        await client.hear_for(2.5)
+        await client.hear_for(2.0)
 
     client = visit(host, story)
     assert client.texts[0]["type"] == "scene"
     times = [struct.unpack("<f", frame[:4])[0] for _, frame in client.frames]
     assert times == sorted(times)
-    assert 100 < len(times) <= 155
+    assert 60 < len(times) <= 125
     assert {len(frame) for _, frame in client.frames} == {4 * (3 + 30) + 15}
     assert times[-1] == pytest.approx(client.frames[-1][0] - client.frames[0][0], abs=0.15)
     assert not [text for text in client.texts if text["type"] == "error"]
@@ -237,7 +237,7 @@ def test_too_many_messages_are_too_many(host: str) -> None:
 def test_a_visitor_who_stops_reading_is_shown_out(
     host: str, ground: Playground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(playground, "STALLED", 2.0)
+    monkeypatch.setattr(playground, "STALLED", 1.5)
 
     async def story() -> None:
         url = f"ws://{host}/api/play"
@@ -246,7 +246,7 @@ def test_a_visitor_who_stops_reading_is_shown_out(
         client = Client(reading)
         await silent.send('{"type":"start","task":"flat"}')
         await client.say("start", task="flat")
-        await client.hear_for(3.5)  # the silent one's socket is not read from
+        await client.hear_for(2.5)  # the silent one's socket is not read from
         count = 0
         with contextlib.suppress(websockets.ConnectionClosed):
             while True:
@@ -319,7 +319,7 @@ def test_a_playground_that_is_full_says_so() -> None:
 def test_two_hundred_visitors_at_once(host: str, ground: Playground) -> None:
     """Each with an agent of their own: every one gets frames, and the server still answers. How fast is for the
     benchmark: here only that nobody starves."""
-    visitors, seconds = 200, 3.0
+    visitors, seconds = 200, 2.0
 
     async def one(k: int, ready: Barrier) -> Client:
         async with websockets.connect(f"ws://{host}/api/play", compression=None, open_timeout=30) as socket:
@@ -370,7 +370,7 @@ def wait_for(true: Callable[[], bool], seconds: float = 8.0) -> bool:
 
 # --- the page in a browser ----------------------------------------------------------------------------------------
 
-LATER = "parseFloat(document.querySelector('[data-play=read-time]')?.textContent) > 0.5"
+LATER = "parseFloat(document.querySelector('[data-play=read-time]')?.textContent) > 0.2"
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -415,7 +415,7 @@ def test_the_pressure_slider_down_makes_the_area_smaller(browser: Any, host: str
         tab.click("[data-value=flat]")
         slider = tab.get_by_label("Pressure", exact=True)
         slider.fill("1")
-        tab.wait_for_timeout(1200)
+        tab.wait_for_timeout(900)
         full, pressure = reading(tab, "area"), reading(tab, "pressure")
         slider.fill("0")
         tab.wait_for_timeout(1500)
@@ -435,7 +435,7 @@ def test_keys_drive_pause_and_reset(browser: Any, host: str) -> None:
             tab.keyboard.press("ArrowRight")
         for _ in range(8):
             tab.keyboard.press("ArrowDown")
-        tab.wait_for_timeout(2500)
+        tab.wait_for_timeout(1500)
         assert abs(reading(tab, "distance")) + abs(reading(tab, "speed")) > 0.1
         assert tab.locator("[data-play=amplitude]").input_value() == "1"
         assert tab.locator("[data-value='-1']").get_attribute("aria-pressed") == "true"
@@ -457,13 +457,13 @@ def test_keys_drive_pause_and_reset(browser: Any, host: str) -> None:
 def test_the_pointer_drags_the_nearest_mass(browser: Any, host: str) -> None:
     with opened(browser, host, viewport={"width": 1200, "height": 800}) as tab:
         tab.click("[data-value=flat]")
-        tab.wait_for_timeout(1200)
+        tab.wait_for_timeout(900)
         before, box = reading(tab, "distance"), tab.locator("canvas").bounding_box()
         x, y = box["x"] + box["width"] / 2, box["y"] + 0.6 * box["height"]
         tab.mouse.move(x + 60, y)
         tab.mouse.down()
         tab.mouse.move(x + 330, y - 60, steps=8)
-        tab.wait_for_timeout(1200)
+        tab.wait_for_timeout(900)
         tab.mouse.up()
         assert reading(tab, "distance") > before + 3
 
