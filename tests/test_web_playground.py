@@ -1,4 +1,4 @@
-"""The playground: sessions without sockets, visitors on real ones, and the page in a real browser."""
+"""The playground: visitors on real sockets, and the page in a real browser."""
 
 import asyncio
 import contextlib
@@ -20,9 +20,9 @@ from starlette.responses import HTMLResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
-from turgor.errors import InvalidInput
 from turgor.web import playground
-from turgor.web.playground import Control, Drag, Playground, Session, Start, Wave, read
+from turgor.web.playground import Playground
+from turgor.web.session import Session, Start
 
 STATIC = Path(playground.__file__).parent / "static"
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><link rel="icon" href="data:,">
@@ -33,167 +33,11 @@ window.playing = start(document.getElementById("here"), "api/play");
 </script>"""
 
 
-# --- sessions -----------------------------------------------------------------------------------------------------
-
-
-def drive(session: Session, seconds: float) -> Session:
-    for _ in range(round(60 * seconds)):
-        session.step()
-    return session
-
-
-def area_ratio(session: Session) -> float:
-    return struct.unpack("<3f", session.frame()[:12])[2]
-
-
-@pytest.mark.parametrize("body", ["small", "medium", "large"])
-def test_the_pressure_is_what_it_is_told_half_a_second_later_and_moves_the_area(body: str) -> None:
-    session = drive(Session(Start(task="flat", body=body)), 2)
-    low, high = session.task.pressure_range[0]
-    areas = []
-    for share in (1.0, 0.0, 0.5):
-        session.tell(Control(share))
-        drive(session, 0.51)
-        np.testing.assert_allclose(session.stand.pressure[0, 0], low + share * (high - low), rtol=1e-5)
-        areas.append(area_ratio(drive(session, 1.5)))
-    assert areas[0] > 0.8
-    assert areas[1] < areas[0] - 0.2
-
-
-def test_an_agent_that_is_told_nothing_stays_as_it_is() -> None:
-    session = Session(Start(task="flat"))
-    pressure = session.stand.pressure[0, 0]
-    drive(session, 3)
-    assert session.stand.pressure[0, 0] == pytest.approx(pressure, rel=1e-5)
-    assert abs(session.com[0]) < 0.1
-
-
-@pytest.mark.parametrize("task", ["flat", "hilly"])
-def test_a_wave_moves_the_agent(task: str) -> None:
-    session = Session(Start(task=task))
-    session.tell(Control(0.5, Wave(amplitude=1.0, frequency=1.2, length=1.0, direction=-1)))
-    before = session.com[0]
-    assert abs(drive(session, 10).com[0] - before) > 0.5
-
-
-def test_the_wave_is_the_one_of_the_formula() -> None:
-    session = Session(Start(task="flat"))
-    session.tell(Control(0.5, Wave(amplitude=0.7, frequency=1.5, length=2.0, direction=1)))
-    drive(session, 0.5)
-    t, j = 29 / 60, np.arange(10)
-    expected = 0.7 * np.sin(2 * np.pi * (1.5 * t - 2 * j / 10))
-    np.testing.assert_allclose(session._commands[0, :10], expected, atol=1e-5)
-
-
-def test_a_hand_pulls_a_mass_where_it_points_and_carries_the_body() -> None:
-    for body in ("small", "large"):
-        session = drive(Session(Start(task="flat", body=body)), 1)
-        target = session.com + [5.0, 30.0]
-        session.drag(Drag(3, *target.tolist()))
-        drive(session, 4)
-        assert np.linalg.norm(session.stand.position[0, 3] - target) < 1.5
-        assert session.com[1] > 15
-        session.drag(None)
-        drive(session, 4)
-        assert session.com[1] < 12
-
-
-@pytest.mark.parametrize("far", [1e9, -1e300])
-def test_a_hand_is_strong_but_not_endless(far: float) -> None:
-    session = Session(Start(task="flat", gravity=0.0))
-    session.drag(Drag(0, far, far))
-    drive(session, 1)
-    assert np.isfinite(session.stand.stand).all()
-    momentum = session._share @ session.stand.velocity[0].astype(np.float64)
-    assert np.linalg.norm(momentum) <= playground.HAND_STRENGTH * 1.01
-    with pytest.raises(InvalidInput, match="mass: expected 0 to 9; got 10"):
-        session.drag(Drag(10, 0.0, 0.0))
-
-
-def test_the_same_messages_at_the_same_steps_give_the_same_bits() -> None:
-    def story() -> list[bytes]:
-        session, frames = Session(Start(task="hilly", seed=3, gravity=7.0, frequency=6.0)), []
-        random = np.random.default_rng(5)
-        for k in range(600):
-            if k % 40 == 0:
-                wave = Wave(*random.uniform(0, 1, 3).tolist(), direction=int(random.choice([-1, 1])))
-                session.tell(Control(float(random.uniform()), wave))
-            if k % 90 == 10:
-                session.drag(Drag(int(random.integers(10)), *(session.com + random.uniform(-9, 9, 2)).tolist()))
-            if k % 90 == 60:
-                session.drag(None)
-            if k == 400:
-                session.restart()
-            session.step()
-            frames.append(session.frame())
-        return frames
-
-    assert story() == story()
-
-
-def test_a_session_without_a_hand_is_the_same_bits_as_the_simulator() -> None:
-    session = Session(Start(task="hilly", body="medium", seed=1))
-    session.tell(Control(0.3, Wave(0.8, 1.0, 1.0, 1)))
-    simulator, seen = playground.Simulator(session.task, threads=2), None
-    simulator.reset(20)
-    for _ in range(100):
-        session.step()
-        seen = simulator.step(np.repeat(session._commands, 20, axis=0))
-    assert seen is not None
-    assert seen.position[7].tobytes() == session.stand.position[0].tobytes()
-
-
-def test_numbers_beyond_what_is_possible_are_cut() -> None:
-    session = Session(Start(task="flat", gravity=1e9, frequency=-3.0))
-    assert (session.start.gravity, session.start.frequency) == (30.0, 1.0)
-    session.tell(Control(-5.0, Wave(9.0, 1e300, -1.0, 1)))
-    assert session.control == Control(0.0, Wave(1.0, 4.0, 0.0, 1))
-    drive(session, 2)
-    assert np.isfinite(session.stand.stand).all()
-
-
-def test_an_agent_that_fell_off_the_world_is_lost() -> None:
-    session = Session(Start(task="flat"))
-    assert not session.lost
-    session.stand.position[0, :, 1] -= 200
-    assert session.lost
-    session.stand.position[:] = np.nan
-    assert session.lost
-
-
-def test_a_scene_tells_all_that_a_page_needs() -> None:
-    scene = json.loads(Session(Start(task="escape", body="large")).scene())
-    assert (scene["type"], scene["masses"], len(scene["springs"]), scene["end"]) == ("scene", 20, 20, 16.0)
-    assert len(scene["scene"]["segments"]) == len(scene["scene"]["depth"]) == 9
-    assert scene["start"] == {
-        "type": "start", "task": "escape", "body": "large", "seed": 0, "gravity": 10.0, "frequency": 8.0,
-    }  # fmt: skip
-    assert len(Session(Start(body="large")).frame()) == 4 * (3 + 40) + 20
-
-
 MALFORMED = [
-    "", "nonsense", "[]", "1", "null", "{}", '{"type":"x"}', '{"type":5}',
-    '{"type":"pause"}', '{"type":"pause","on":1}',
-    '{"type":"reset","more":1}', '{"type":"control"}', '{"type":"control","pressure":"high"}',
-    '{"type":"control","pressure":NaN}', '{"type":"control","pressure":1e999}', '{"type":"control","pressure":null}',
-    '{"type":"control","pressure":0.5,"wave":{"direction":0}}', '{"type":"control","pressure":0.5,"wave":[1]}',
-    '{"type":"start","task":"moon"}', '{"type":"start","seed":-1}', '{"type":"start","seed":1.5}',
-    '{"type":"start","seed":%s}' % ("9" * 300), '{"type":"start","body":"huge"}', '{"type":"drag","mass":0,"x":0}',
-    '{"type":"drag","mass":-1,"x":0,"y":0}', '{"type":"drag","mass":99999999999999999999,"x":0,"y":0}',
-    "[" * 4000, '{"a":' * 700, " " * 5000, '{"type":"pause","on":true}' + " " * 4096, "\x00", "\ud800", "💥" * 50,
+    "", "nonsense", "[]", "null", '{"type":"x"}', '{"type":"pause","on":1}', '{"type":"reset","more":1}', "[" * 4000,
+    '{"type":"control","pressure":NaN}', '{"type":"control","pressure":1e999}', '{"type":"start","task":"moon"}',
+    '{"type":"drag","mass":-1,"x":0,"y":0}', " " * 5000, "\x00", "💥" * 50, b"", b"\xff\x00", b"\x00" * 5000,
 ]  # fmt: skip
-
-
-@pytest.mark.parametrize("text", MALFORMED, ids=range(len(MALFORMED)))
-def test_what_is_no_message_is_refused_in_one_line(text: str) -> None:
-    def take() -> None:
-        message = read({"type": "websocket.receive", "text": text})
-        Session(message) if isinstance(message, Start) else Session(Start()).drag(message)
-
-    with pytest.raises(InvalidInput) as error:
-        take()
-    assert "\n" not in str(error.value)
-    assert len(str(error.value)) < 150
 
 
 # --- visitors -----------------------------------------------------------------------------------------------------
@@ -294,13 +138,13 @@ def visit(host: str, story: Callable[[Client], Awaitable[None]], **options: Any)
 def test_a_visitor_sees_the_agent_in_real_time(host: str, ground: Playground) -> None:
     async def story(client: Client) -> None:
         await client.say("start", task="flat", body="medium")
-        await client.hear_for(2.5)
+        await client.hear_for(2.0)
 
     client = visit(host, story)
     assert client.texts[0]["type"] == "scene"
     times = [struct.unpack("<f", frame[:4])[0] for _, frame in client.frames]
     assert times == sorted(times)
-    assert 100 < len(times) <= 155
+    assert 60 < len(times) <= 125
     assert {len(frame) for _, frame in client.frames} == {4 * (3 + 30) + 15}
     assert times[-1] == pytest.approx(client.frames[-1][0] - client.frames[0][0], abs=0.15)
     assert not [text for text in client.texts if text["type"] == "error"]
@@ -362,9 +206,8 @@ def test_a_thousand_malformed_messages_end_one_visit_and_nobody_elses(host: str,
                 bad = await stack.enter_async_context(websockets.connect(url, compression=None))
                 with contextlib.suppress(websockets.ConnectionClosed):
                     for text in MALFORMED * 4:
-                        if text != "\ud800":
-                            sent += 1
-                            await bad.send(text)
+                        sent += 1
+                        await bad.send(text)
                     while True:
                         await asyncio.wait_for(bad.recv(), 5)
                 assert (bad.close_code, bad.close_reason) == (1008, "more than 50 bad messages")
@@ -394,7 +237,7 @@ def test_too_many_messages_are_too_many(host: str) -> None:
 def test_a_visitor_who_stops_reading_is_shown_out(
     host: str, ground: Playground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(playground, "STALLED", 2.0)
+    monkeypatch.setattr(playground, "STALLED", 1.5)
 
     async def story() -> None:
         url = f"ws://{host}/api/play"
@@ -403,7 +246,7 @@ def test_a_visitor_who_stops_reading_is_shown_out(
         client = Client(reading)
         await silent.send('{"type":"start","task":"flat"}')
         await client.say("start", task="flat")
-        await client.hear_for(3.5)  # the silent one's socket is not read from
+        await client.hear_for(2.5)  # the silent one's socket is not read from
         count = 0
         with contextlib.suppress(websockets.ConnectionClosed):
             while True:
@@ -436,6 +279,30 @@ def test_a_visitor_who_says_nothing_is_paused(host: str, monkeypatch: pytest.Mon
     visit(host, story)
 
 
+def test_a_visitor_without_an_agent_makes_room(host: str, ground: Playground, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(playground, "ABSENT", 0.3)
+
+    async def story(client: Client) -> None:
+        with pytest.raises(websockets.ConnectionClosed):
+            await client.hear()
+        assert client.socket.close_code == 1001
+
+    visit(host, story)
+    assert wait_for(lambda: ground.visitors == 0)
+
+
+def test_an_agent_that_left_the_world_starts_again(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Session, "lost", property(lambda session: session.steps > 30))
+
+    async def story(client: Client) -> None:
+        await client.say("start", task="flat")
+        await client.hear_for(1.3)
+        assert client.numbers()[0] < 0.6
+        assert any("left the world" in text.get("message", "") for text in client.texts)
+
+    visit(host, story)
+
+
 def test_a_playground_that_is_full_says_so() -> None:
     async def story(host: str) -> None:
         url = f"ws://{host}/api/play"
@@ -452,7 +319,7 @@ def test_a_playground_that_is_full_says_so() -> None:
 def test_two_hundred_visitors_at_once(host: str, ground: Playground) -> None:
     """Each with an agent of their own: every one gets frames, and the server still answers. How fast is for the
     benchmark: here only that nobody starves."""
-    visitors, seconds = 200, 3.0
+    visitors, seconds = 200, 2.0
 
     async def one(k: int, ready: Barrier) -> Client:
         async with websockets.connect(f"ws://{host}/api/play", compression=None, open_timeout=30) as socket:
@@ -503,7 +370,7 @@ def wait_for(true: Callable[[], bool], seconds: float = 8.0) -> bool:
 
 # --- the page in a browser ----------------------------------------------------------------------------------------
 
-LATER = "parseFloat(document.querySelector('[data-play=read-time]')?.textContent) > 0.5"
+LATER = "parseFloat(document.querySelector('[data-play=read-time]')?.textContent) > 0.2"
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -548,7 +415,7 @@ def test_the_pressure_slider_down_makes_the_area_smaller(browser: Any, host: str
         tab.click("[data-value=flat]")
         slider = tab.get_by_label("Pressure", exact=True)
         slider.fill("1")
-        tab.wait_for_timeout(1200)
+        tab.wait_for_timeout(900)
         full, pressure = reading(tab, "area"), reading(tab, "pressure")
         slider.fill("0")
         tab.wait_for_timeout(1500)
@@ -568,7 +435,7 @@ def test_keys_drive_pause_and_reset(browser: Any, host: str) -> None:
             tab.keyboard.press("ArrowRight")
         for _ in range(8):
             tab.keyboard.press("ArrowDown")
-        tab.wait_for_timeout(2500)
+        tab.wait_for_timeout(1500)
         assert abs(reading(tab, "distance")) + abs(reading(tab, "speed")) > 0.1
         assert tab.locator("[data-play=amplitude]").input_value() == "1"
         assert tab.locator("[data-value='-1']").get_attribute("aria-pressed") == "true"
@@ -590,13 +457,13 @@ def test_keys_drive_pause_and_reset(browser: Any, host: str) -> None:
 def test_the_pointer_drags_the_nearest_mass(browser: Any, host: str) -> None:
     with opened(browser, host, viewport={"width": 1200, "height": 800}) as tab:
         tab.click("[data-value=flat]")
-        tab.wait_for_timeout(1200)
+        tab.wait_for_timeout(900)
         before, box = reading(tab, "distance"), tab.locator("canvas").bounding_box()
         x, y = box["x"] + box["width"] / 2, box["y"] + 0.6 * box["height"]
         tab.mouse.move(x + 60, y)
         tab.mouse.down()
         tab.mouse.move(x + 330, y - 60, steps=8)
-        tab.wait_for_timeout(1200)
+        tab.wait_for_timeout(900)
         tab.mouse.up()
         assert reading(tab, "distance") > before + 3
 

@@ -156,8 +156,9 @@ export class View {
     c.fillStyle = sky;
     c.fillRect(0, 0, width, height);
     this.drawGrid();
-    this.drawGround();
+    const seen = this.drawGround();
     this.drawWalls();
+    this.drawRuler(seen);
     this.drawTrail(motion, frame);
     this.drawBody(frame);
     if (hand) this.drawHand(frame, hand);
@@ -189,7 +190,7 @@ export class View {
     const c = this.context, bottom = this.size[1] + 10, thick = SURFACE * this.scale;
     const [left] = this.metres(-20, 0), [right] = this.metres(this.size[0] + 20, 0);
     const seen = this.ground.filter(([a, , b]) => a <= right && b >= left);
-    if (!seen.length) return;
+    if (!seen.length) return seen;
     const line = [seen[0].slice(0, 2), ...seen.map((s) => s.slice(2))].map(([x, y]) => this.pixel(x, y));
     c.beginPath();
     c.moveTo(line[0][0], bottom);
@@ -206,11 +207,11 @@ export class View {
     c.strokeStyle = this.colours.edge;
     c.stroke();
     c.restore();
-    this.drawRuler(seen, thick);
+    return seen;
   }
 
-  drawRuler(ground, thick) {
-    const c = this.context;
+  drawRuler(ground) {
+    const c = this.context, thick = SURFACE * this.scale;
     c.font = "12px system-ui, sans-serif";
     c.textAlign = "center";
     c.textBaseline = "top";

@@ -12,6 +12,7 @@ const SLIDERS = {
   gravity: { label: "Gravity", min: 0, max: 25, step: 0.5, value: 10, text: (v) => `${v.toFixed(1)} m/s²` },
   frequency: { label: "Spring frequency", min: 1, max: 20, step: 0.5, value: 8, text: (v) => `${v.toFixed(1)} Hz` },
 };
+const NOTICE = 6000; // [ms], how long a notice stays while frames come
 const KEYS = [
   ["↑ ↓", "more or less pressure"],
   ["→", "a stronger clockwise wave"],
@@ -29,7 +30,7 @@ export function start(element, socketUrl) {
   const canvas = find("canvas"), view = new View(canvas), ended = new AbortController(), { signal } = ended;
   const choice = { task: "hilly", body: "small", seed: 0 };
   let socket = null, motion = null, frame = null, hand = null, direction = -1;
-  let paused = false, changed = false, seen = 0, said = 0, before = performance.now(), hint = true;
+  let paused = false, changed = false, seen = 0, said = 0, came = 0, noticed = 0, before = performance.now(), hint = true;
 
   // --- talking to the server ---
 
@@ -79,8 +80,9 @@ export function start(element, socketUrl) {
 
   function see(buffer) {
     motion?.add(buffer);
-    if (performance.now() - seen > 200) {
-      seen = performance.now();
+    came = performance.now();
+    if (came - seen > 200) {
+      seen = came;
       say({ type: "seen" });
     }
   }
@@ -120,6 +122,7 @@ export function start(element, socketUrl) {
   }
 
   function notice(text) {
+    noticed = performance.now();
     show("notice", text);
     find("notice").hidden = !text;
   }
@@ -244,12 +247,13 @@ export function start(element, socketUrl) {
       view.draw(motion, frame, elapsed, hand);
       readings();
     }
+    if (came > noticed + NOTICE) find("notice").hidden = true;
     find("hint").hidden = !hint || !frame;
     requestAnimationFrame(draw);
   }
 
   function readings() {
-    const minus = (text) => text.replace("-", "−");
+    const minus = (text) => (Number.parseFloat(text) === 0 ? text.replace("-", "") : text.replace("-", "−"));
     show("read-pressure", `${(frame.pressure / 1000).toFixed(1)} kPa`);
     show("read-area", frame.area.toFixed(2));
     show("read-speed", minus(`${motion.speed.toFixed(2)} m/s`));
