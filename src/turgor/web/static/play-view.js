@@ -234,10 +234,22 @@ export class View {
 
   drawWalls() {
     const c = this.context;
-    c.fillStyle = this.colours.solid;
-    for (const block of this.blocks) this.fill(block);
+    c.fillStyle = c.strokeStyle = this.colours.solid;
+    c.lineWidth = 1;
+    for (const block of this.blocks) {
+      this.fill(block);
+      c.stroke(); // no seam between a wall and the ground
+    }
     c.fillStyle = this.colours.edge;
-    for (const wall of this.walls) this.fill(reachBack(wall, SURFACE));
+    for (const wall of this.walls) this.fill(reachBack(this.aboveGround(wall), SURFACE));
+  }
+
+  /** The part of a vertical wall that stands out of the ground, other walls whole. */
+  aboveGround([x1, y1, x2, y2]) {
+    const under = x1 === x2 ? this.ground.filter(([a, , b]) => a <= x1 && x1 <= b) : [];
+    if (!under.length) return [x1, y1, x2, y2];
+    const top = Math.max(...under.map(([a, y, b, z]) => y + ((z - y) * (x1 - a)) / (b - a)));
+    return [x1, Math.max(y1, top), x2, Math.max(y2, top)];
   }
 
   fill(corners) {

@@ -145,6 +145,7 @@ export function start(element, socketUrl) {
     set("amplitude", Math.abs(strength) < 0.001 ? 0 : Math.abs(strength));
   }
 
+  root.addEventListener("submit", (event) => event.preventDefault(), { signal });
   root.addEventListener("input", ({ target }) => {
     if (target.dataset.world) showValues();
     else if (target.type === "range") set(target.dataset.play, Number(target.value));
@@ -275,6 +276,9 @@ export function start(element, socketUrl) {
   // nobody watches a hidden page: the server need not work for it
   document.addEventListener("visibilitychange", () => paused || say({ type: "pause", on: document.hidden }), { signal });
 
+  // here rather than in the markup, which a server's content security policy may not allow
+  root.style.setProperty("--pressures", gradient("pressure"));
+  find("strain").style.background = gradient("strain");
   match();
   showValues();
   connect();
@@ -321,19 +325,19 @@ function page() {
     <canvas data-play="canvas" tabindex="0" role="img"
       aria-label="The agent, seen from the side. Drag a mass with the pointer; arrow keys drive it."></canvas>
     <dl class="play-readings">${shown.map(reading).join("")}<div class="play-out"><dd data-play="read-out"></dd></div></dl>
-    <div class="play-legend" aria-hidden="true"><i style="background:${gradient("strain")}"></i>
+    <div class="play-legend" aria-hidden="true"><i data-play="strain"></i>
       <span>springs: short</span><span>long</span></div>
     <p class="play-hint" data-play="hint" hidden>drag a mass, or press <kbd>→</kbd></p>
     <p class="play-notice" data-play="notice" role="status" hidden></p>
     <div class="play-closed" data-play="closed" role="alert" hidden>
       <p data-play="why"></p><button type="button" class="play-main" data-play="reconnect">Reconnect</button></div>
   </div>
-  <form class="play-controls" onsubmit="return false" aria-label="Controls">
+  <form class="play-controls" aria-label="Controls">
     <div class="play-row">
       <button type="button" class="play-main" data-play="pause">Pause</button>
       <button type="button" data-play="reset">Reset</button>
     </div>
-    <fieldset><legend>Gas</legend><div class="play-gas" style="--map:${gradient("pressure")}">${slider("pressure")}</div></fieldset>
+    <fieldset><legend>Gas</legend><div class="play-gas">${slider("pressure")}</div></fieldset>
     <fieldset><legend>Wave of contraction</legend>
       ${slider("amplitude")}${slider("pace")}${slider("length")}
       ${choices("direction", "Direction of the wave", { 1: "↺ counter-clockwise", "-1": "↻ clockwise" })}</fieldset>
