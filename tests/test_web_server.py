@@ -537,6 +537,15 @@ def test_a_page_that_does_not_read_is_dropped_and_the_others_go_on(
         deaf.close()
 
 
+def test_answers_are_not_held_back(web: Served) -> None:
+    def seconds() -> float:
+        began = time.perf_counter()
+        assert web.get("/api/library").status_code == 200
+        return time.perf_counter() - began
+
+    assert min(seconds() for _ in range(20)) < 0.03  # Nagle and delayed acknowledgements: 0.04 s
+
+
 def test_a_burst_of_changes_is_one_message() -> None:
     hub = Hub(Library("."))
     client = servers.Client()

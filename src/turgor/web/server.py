@@ -378,7 +378,7 @@ def listen(host: str, port: int | None) -> socket.socket:
         raise InvalidInput("--host: expected a name or an address of this machine", describe(host)) from None
     reason = ""
     for number in tried:
-        listener = socket.socket(family, socket.SOCK_STREAM)
+        listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # named, or asyncio leaves Nagle on
         try:
             if sys.platform != "win32":
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
