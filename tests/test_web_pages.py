@@ -187,7 +187,7 @@ def test_a_running_evolution_is_followed(open_page: Callable[..., Page], folder:
             evolution.send_signal(signal.SIGINT)
             evolution.wait(30)
     page.wait_for_selector(".head .badge.interrupted")
-    page.wait_for_selector("canvas")  # its champion is shown, and no longer asked for
+    page.wait_for_selector(".stage canvas", timeout=60_000)  # its replay is made from the files
     shutil.rmtree(folder / "now")
     page.goto(page.url.partition("#")[0] + "#/")
     until(page, lambda: page.locator("tbody tr").count() == 6)

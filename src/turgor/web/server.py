@@ -44,7 +44,8 @@ HEARTBEAT = 15.0  # [s]
 MOST_CLIENTS = 1_000
 REPLAYS, REPLAY_BYTES = 24, 64_000_000  # kept in memory, at most
 MOST_REPLAYS_WAITING = 32
-MOST_WORK = 5_000_000  # steps times masses of a run that is simulated for its replay
+# of a run that is simulated for its replay: steps times masses, masses, segments of the ground
+MOST_WORK, MOST_MASSES, MOST_SEGMENTS = 5_000_000, 300, 20_000
 MESSAGE_BYTES = 65_536  # of the playground's client
 
 
@@ -171,7 +172,7 @@ class Hub:
                 self.publish(await asyncio.to_thread(self._library.look))
             except Exception:  # the next look may go better
                 traceback.print_exc()
-            await asyncio.sleep(max(INTERVAL, 5 * (time.perf_counter() - began)))
+            await asyncio.sleep(max(INTERVAL, 12 * (time.perf_counter() - began)))  # at most 8 % of a core
 
     def publish(self, events: list[Event]) -> None:
         """Tells every client."""
@@ -296,8 +297,10 @@ def _replay(folder: Path, which: str) -> bytes:
     from turgor.web.replay import replay_of_run
 
     task = Run.open(folder).task
-    if task.steps * task.body.mass_count > MOST_WORK:
-        raise Refused(413, f"replay: expected at most {MOST_WORK} steps times masses; got {task!r}")
+    masses, segments = task.body.mass_count, len(task.scene.segments)
+    if task.steps * masses > MOST_WORK or masses > MOST_MASSES or segments > MOST_SEGMENTS:
+        found = f"{masses} masses, {segments} segments, {task.steps} steps"
+        raise Refused(413, f"replay: expected a run that is quick to simulate; got {found}")
     return replay_of_run(folder, which)
 
 

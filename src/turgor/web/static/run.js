@@ -13,7 +13,8 @@ export function show(element, store, path = "") {
   const robust = h("div", { class: "robust" });
   const facts = h("div", { class: "facts" });
   const history = new History({ generation: [], evaluations: [], best: [], median: [], sigma: [], seconds: [] });
-  let details = null, curves = null, ended = false, endFilm = null, filmed = null;
+  const newer = h("button", { type: "button", hidden: true, onclick: () => ((filmed = null), load()) }, "A better one was found: play it");
+  let details = null, curves = null, ended = false, endFilm = null, loading = false, filmed = null; // fitness of the agent that plays
 
   element.append(
     h("p", { class: "back" }, h("a", { href: "#/" }, "← all runs")), head, tiles,
@@ -23,11 +24,14 @@ export function show(element, store, path = "") {
   );
 
   async function load() {
+    loading = true;
     try {
       details = await ask("run", path);
     } catch (error) {
       if (!ended) head.replaceChildren(h("h1", {}, path || store.folder), failure(error.message));
       return;
+    } finally {
+      loading = false;
     }
     if (ended) return;
     history.columns = details.history;
@@ -61,11 +65,10 @@ export function show(element, store, path = "") {
   }
 
   function drawFilm() {
-    const key = details.champion ? `${details.champion.generation} ${details.champion.solver}` : null;
-    if (key === filmed) return;
-    if (key === null) return film.replaceChildren(h("p", { class: "muted" }, "There is no champion yet."));
+    if (!details.champion) return film.replaceChildren(h("p", { class: "muted" }, "There is no champion yet."));
+    newer.hidden = filmed === null || details.champion.fitness <= filmed;
     if (filmed !== null) return; // one that plays is not taken away
-    filmed = key;
+    filmed = details.champion.fitness;
     const stage = h("div");
     const play = (which) => {
       endFilm?.();
@@ -74,6 +77,7 @@ export function show(element, store, path = "") {
     const { solver, fitness } = details.champion;
     const other = solver !== null && solver !== fitness;
     film.replaceChildren(
+      newer,
       other ? h("div", { class: "choice", role: "group", "aria-label": "Which agent" },
         pick("best", "Best fitness", true), pick("solver", "Best that solves the task", false)) : "",
       stage,
@@ -120,7 +124,8 @@ export function show(element, store, path = "") {
     if (event.detail.path !== path || !details) return;
     if (!history.take(event.detail.rows, event.detail.first)) return void load();
     curves.draw();
-    if (filmed === null) load(); // there is a champion now
+    if (filmed === null && !loading) load(); // there may be a champion now
+    newer.hidden = filmed === null || !(history.columns.best.at(-1) > filmed);
   }
 
   load();
