@@ -45,7 +45,7 @@ EXPORT = Command(
     "examples:\n"
     "  turgor export runs/hilly-small-pressure-s0 --out replay.html\n"
     "  turgor export runs/hilly-small-pressure-s0 runs/hilly-small-pressure-s1\n"
-    "  turgor export --gallery results/paper --out gallery.html",
+    "  turgor export --gallery runs/paper --out gallery.html",
     _options,
     _export,
 )

@@ -324,6 +324,7 @@ class Server(uvicorn.Server):
                 server_header=False,
                 ws="websockets-sansio",
                 ws_max_size=MESSAGE_BYTES,
+                ws_per_message_deflate=False,  # frames of the playground are short
                 limit_concurrency=2 * MOST_CLIENTS,
                 timeout_graceful_shutdown=2,
                 lifespan="on",
