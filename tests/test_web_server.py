@@ -110,6 +110,7 @@ def test_every_run_is_listed_with_its_numbers(web: Served, made: Path) -> None:
     ]
     assert (first["generation"], first["evaluations"], first["budget"], first["solved"]) == (2, 42, 42, False)
     assert first["fitness"] == float((made / "escape-s1" / "history.csv").read_text().splitlines()[-1].split(",")[2])
+    assert first["kept"] == first["fitness"]
     assert first["robust"] == json.loads((made / "escape-s1" / "run.json").read_text())["result"]["robust_fitness"]
     assert (flat["body"], flat["solved"]) == ("medium", None)  # by its masses: it has no recipe
 

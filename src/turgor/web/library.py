@@ -48,6 +48,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     fitness: float | None
     robust: float | None
     solved: bool | None  # None: nothing to solve, or not known yet
+    kept: float | None  # fitness of the champion that is in its file by now
     status: Status
     note: str | None
     generation: int
@@ -301,6 +302,7 @@ class _Watch:
         self._path, self._folder = path, folder
         self._record: _Record | None = None
         self._solved: bool | None = None
+        self._kept: float | None = None
         self._row: Row | None = None  # the last one of the history
         self._offset = 0  # in the history, after its last whole row
         self._marks: tuple[Any, ...] = (None, None, None)  # times and sizes of the files
@@ -335,7 +337,8 @@ class _Watch:
             rows = self._read_history(files[1], self._marks[1] and marks[1] and marks[1][2] == self._marks[1][2])
         if marks[2] != self._marks[2]:
             check_arrays(self._folder / "champion.npz")
-            self._solved = None if self._record.task.end is None else _read_solved(self._folder / "champion.npz")
+            self._kept, solved = _read_champion(self._folder / "champion.npz")
+            self._solved = None if self._record.task.end is None else solved
         known = self.summary is not None
         self._marks, self.problem = marks, None
         summary = self._summarise(max(f.st_mtime for f in files if f is not None))
@@ -392,6 +395,7 @@ class _Watch:
             fitness=record.result.fitness if row is None else row[2],
             robust=record.result.robust_fitness,
             solved=self._solved,
+            kept=self._kept,
             status=status,
             note=None if record.note is None else describe_long(record.note),
             generation=0 if row is None else row[0],
@@ -459,12 +463,14 @@ def _array_bytes(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
     return math.prod(int(n) for n in shape) * dtype.itemsize
 
 
-def _read_solved(path: Path) -> bool | None:
-    """Whether the champion solved its task; None where it does not tell."""
+def _read_champion(path: Path) -> tuple[float | None, bool | None]:
+    """The champion's fitness and whether it solved its task; None where the file does not tell."""
     if not path.exists():
-        return None
+        return None, None
     with np.load(path, allow_pickle=False) as arrays:
-        return bool(arrays["solved"]) if "solved" in arrays.files else None
+        found = {name: arrays[name].item() for name in ("fitness", "solved") if name in arrays.files}
+    fitness, solved = found.get("fitness"), found.get("solved")
+    return None if fitness is None else float(fitness), None if solved is None else bool(solved)
 
 
 def _thinned(run: Run) -> dict[str, np.ndarray]:

@@ -54,8 +54,9 @@ export function show(element, store, path = "") {
     const unit = run.unit ? ` ${run.unit}` : "";
     const { champion } = details;
     const solved = champion?.solved ?? null;
+    const found = history.columns.best.findIndex((best) => best === run.fitness);
     tiles.replaceChildren(...[
-      ["fitness", number(run.fitness, 3) + unit, champion ? `found in generation ${count(champion.generation)}` : ""],
+      ["fitness", number(run.fitness, 3) + unit, found < 0 ? "" : `found in generation ${count(history.columns.generation[found])}`],
       ["robust", number(run.robust, 3) + (run.robust === null ? "" : unit), run.robust !== null ? "median of moved starts" : run.status === "running" ? "measured at the end" : "not measured"],
       solved === null ? null : ["task", solved ? "solved" : "not solved", solved ? `in ${number(champion.steps * details.task.dt, 1)} s` : ""],
       ["evaluations", count(run.evaluations), `of ${count(run.budget)}, generation ${count(run.generation)}`],
@@ -66,9 +67,9 @@ export function show(element, store, path = "") {
 
   function drawFilm() {
     if (!details.champion) return film.replaceChildren(h("p", { class: "muted" }, "There is no champion yet."));
-    newer.hidden = filmed === null || details.champion.fitness <= filmed;
     if (filmed !== null) return; // one that plays is not taken away
     filmed = details.champion.fitness;
+    newer.hidden = true;
     const stage = h("div");
     const play = (which) => {
       endFilm?.();
@@ -118,6 +119,7 @@ export function show(element, store, path = "") {
     const run = store.runs.get(path);
     if (run && details && run.status !== details.status) load();
     else draw();
+    newer.hidden = filmed === null || !(run?.kept > filmed);
   }
 
   function onRows(event) {
@@ -125,7 +127,6 @@ export function show(element, store, path = "") {
     if (!history.take(event.detail.rows, event.detail.first)) return void load();
     curves.draw();
     if (filmed === null && !loading) load(); // there may be a champion now
-    newer.hidden = filmed === null || !(history.columns.best.at(-1) > filmed);
   }
 
   load();
