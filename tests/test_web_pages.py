@@ -14,23 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import turgor.web
 from turgor.evolution.loop import evolve
 from turgor.task import make_task
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-STATIC = Path(turgor.web.__file__).parent / "static"
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-FLAGS += ["--disable-component-update", "--disable-sync"]
 SCRIPT = "<img src=x onerror=window.hurt=1>"
-
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
-    pytest.mark.skipif(not (STATIC / "player.js").exists(), reason="this version has no player yet"),
-]
 
 
 @pytest.fixture(scope="module")
@@ -73,15 +63,6 @@ def serve() -> Iterator[Callable[..., str]]:
 @pytest.fixture(scope="module")
 def address(folder: Path, serve: Callable[..., str]) -> str:
     return serve(str(folder))
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as tool:
-        chromium = tool.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

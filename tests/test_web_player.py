@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import launch, until, watched_page
+from browser import until, watched_page
 
 from turgor.cli import main
 from turgor.evolution.loop import evolve
@@ -20,12 +19,6 @@ from turgor.web.export import export_gallery, export_replays
 from turgor.web.replay import read_replay, replay_of_recording, replay_of_run
 
 DARK = {"color_scheme": "dark"}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with launch() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import uvicorn
 import websockets
+from browser import until, watched_page
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
@@ -375,44 +376,16 @@ def wait_for(true: Callable[[], bool], seconds: float = 8.0) -> bool:
 # --- the page in a browser ----------------------------------------------------------------------------------------
 
 LATER = "parseFloat(document.querySelector('[data-play=read-time]')?.textContent) > 0.2"
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="the browser's tests need playwright")
-    with sync_api.sync_playwright() as tool:
-        options = {"executable_path": CHROMIUM} if Path(CHROMIUM).exists() else {}
-        try:
-            chromium = tool.chromium.launch(args=ARGUMENTS, **options)
-        except sync_api.Error:
-            pytest.skip("the browser's tests need Chromium")
-        yield chromium
-        chromium.close()
 
 
 @contextlib.contextmanager
 def opened(browser: Any, host: str, **options: Any) -> Iterator[Any]:
-    """The page, without a word on its console."""
-    context = browser.new_context(**options)
-    tab, wrong = context.new_page(), []
-    tab.on("pageerror", lambda error: wrong.append(str(error)))
-    tab.on("console", lambda message: wrong.append(message.text))
-    tab.set_default_timeout(10_000)
-    tab.goto(f"http://{host}/")
-    until(tab, LATER)
-    yield tab
-    context.close()
-    assert wrong == []
-
-
-def until(tab: Any, expression: str) -> None:
-    """Waits until it is true; the page's policy forbids Playwright's own way, which evaluates in the page."""
-    assert wait_for(lambda: tab.evaluate(expression)), expression
+    """The page, once its agent moves."""
+    with watched_page(browser, **options) as tab:
+        tab.set_default_timeout(10_000)
+        tab.goto(f"http://{host}/")
+        until(tab, LATER)
+        yield tab
 
 
 def reading(tab: Any, name: str) -> float:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browser import launch, until, watched_page
+from browser import until, watched_page
 
 from turgor.evolution.loop import evolve
 from turgor.task import make_task
@@ -18,12 +18,6 @@ from turgor.task import make_task
 PIXELS = """() => { const c = document.querySelector("canvas"), g = c.getContext("2d");
     const pixels = new Uint32Array(g.getImageData(0, 0, c.width, c.height).data.buffer);
     return pixels.reduce((a, b) => (31 * a + b) | 0, 7) }"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with launch() as started:
-        yield started
 
 
 @pytest.fixture(scope="module")
