@@ -33,8 +33,10 @@ from turgor.experiments.rows import Champion, write_rows
 from turgor.task import make_task
 from turgor.web import library as libraries
 from turgor.web import server as servers
-from turgor.web.library import Event, Library
+from turgor.web import watch
+from turgor.web.library import Library
 from turgor.web.server import Hub, Server, listen, make_app
+from turgor.web.watch import Event
 
 ROW = "{0},{1},1.5,0.5,0.4,0.1\n"
 
@@ -339,7 +341,7 @@ def test_of_a_long_history_only_the_end_is_read(folder: Path, monkeypatch: pytes
     library.look()
     assert time.perf_counter() - began < 0.5
     parsed = []
-    monkeypatch.setattr(libraries, "_parse", lambda line, parse=libraries._parse: parsed.append(line) or parse(line))
+    monkeypatch.setattr(watch, "_parse", lambda line, parse=watch._parse: parsed.append(line) or parse(line))
     with open(history, "a") as file:
         file.write(ROW.format(200_001, 21 * 200_001))
     library.look()

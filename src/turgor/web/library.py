@@ -6,56 +6,25 @@ The folder may be a stranger's: only plain files of sane size are read, links ar
 
 from __future__ import annotations
 
-import math
 import os
-import time
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from turgor.body import SIZES
 from turgor.errors import InvalidInput, describe
 from turgor.experiments.rows import Champion, read_rows
-from turgor.runs import COLUMNS, FORMAT, Row, Run, Settings, Status
+from turgor.runs import COLUMNS, Run
 from turgor.web.guard import Refused, check_file
+from turgor.web.watch import HISTORY_BYTES, RECORD_BYTES, Event, Record, RunSummary, RunWatch, check_arrays
 
 MARK = "campaign.json"  # as in experiments/reproduce.py, which would load the figures too
 DEPTH = 4  # folders below the served one in which runs are looked for
 MOST_FOLDERS, MOST_RUNS = 20_000, 5_000
-RECORD_BYTES, HISTORY_BYTES, CHAMPION_BYTES, TABLE_BYTES = 5_000_000, 50_000_000, 50_000_000, 5_000_000
-TAIL_BYTES, NEWS_BYTES = 4_096, 200_000  # of a history: read for its last row, and of its new rows at most
+TABLE_BYTES = 5_000_000
 MOST_ROWS = 4_000  # of a history that are handed to the page
-QUIET = 180.0  # [s] without a new generation after which a run that does not say it ended is taken for interrupted
-LARGEST_INTEGER = 2**53  # that a page can hold
-
-
-class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """A run in one row."""
-
-    path: str  # of its folder in the served one, "" for that itself
-    name: str  # of the task
-    body: str  # small, medium, large, custom
-    condition: str
-    controller: str
-    strategy: str
-    seed: int
-    change: str  # what the recipe has besides, as in window=15
-    unit: str  # of the fitness
-    fitness: float | None
-    robust: float | None
-    solved: bool | None  # None: nothing to solve, or not known yet
-    kept: float | None  # fitness of the champion that is in its file by now
-    status: Status
-    note: str | None
-    generation: int
-    evaluations: int
-    budget: int
-    sigma: float | None
-    modified: float  # [s] since 1970
 
 
 class CampaignSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,58 +49,13 @@ class Group(msgspec.Struct, kw_only=True):
     runs: list[str | None] = []  # their paths; None: only in the tables
 
 
-class Event(NamedTuple):
-    """What the page is told: run, rows, gone, library (ask for all of it anew)."""
-
-    kind: str
-    data: Any
-
-
-# --- what is read of run.json, the rest of which may be anything ----------------------------------------------------
-
-
-class _Body(msgspec.Struct, frozen=True):
-    position: list[Any] = []
-    gas_amount: list[float] = []
-
-
-class _Controller(msgspec.Struct, frozen=True):
-    type: str = "linear"
-
-
-class _Task(msgspec.Struct):
-    name: str
-    condition: str
-    body: _Body = _Body()
-    controller: _Controller = _Controller()
-    fitness: str = ""
-    end: Any = None
-
-
-class _Result(msgspec.Struct, frozen=True):
-    fitness: float | None = None
-    robust_fitness: float | None = None
-
-
-class _Record(msgspec.Struct):
-    format: int
-    status: Status
-    settings: Settings
-    task: _Task
-    note: str | None = None
-    result: _Result = _Result()
-
-
-# --- the library --------------------------------------------------------------------------------------------------
-
-
 class Library:
     """The runs and campaigns in a folder, and what is wrong with the others, as of the last `look`."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder).resolve()
         self.problems: dict[str, str] = {}
-        self._watches: dict[str, _Watch] = {}
+        self._watches: dict[str, RunWatch] = {}
         self._campaigns: dict[str, bool] = {}  # whether it has tables
 
     @property
@@ -164,7 +88,7 @@ class Library:
         events: list[Event] = []
         for path in self._find(problems, campaigns):
             seen.add(path)
-            watch = self._watches.setdefault(path, _Watch(path, self.folder / path))
+            watch = self._watches.setdefault(path, RunWatch(path, self.folder / path))
             events += watch.look()
             if watch.problem is not None:
                 problems[path] = watch.problem
@@ -224,7 +148,7 @@ class Library:
             run = Run.open(folder)
         except InvalidInput as error:  # as with a task of the user's own functions: what can be told is
             found["problem"] = str(error).replace(f"{folder}{os.sep}", "")
-            record = msgspec.json.decode((folder / "run.json").read_bytes(), type=_Record)
+            record = msgspec.json.decode((folder / "run.json").read_bytes(), type=Record)
             return found | {"settings": record.settings, "history": {name: [] for name in COLUMNS}}
         found["history"] = {name: column.tolist() for name, column in _thinned(run).items()}
         found["settings"] = run.settings
@@ -290,189 +214,6 @@ class Library:
         return {"path": path, "groups": list(groups.values())}
 
 
-# --- one run ------------------------------------------------------------------------------------------------------
-
-
-class _Watch:
-    """A run's folder: what it was when last looked at."""
-
-    def __init__(self, path: str, folder: Path) -> None:
-        self.summary: RunSummary | None = None
-        self.problem: str | None = None
-        self._path, self._folder = path, folder
-        self._record: _Record | None = None
-        self._solved: bool | None = None
-        self._kept: float | None = None
-        self._row: Row | None = None  # the last one of the history
-        self._offset = 0  # in the history, after its last whole row
-        self._marks: tuple[Any, ...] = (None, None, None)  # times and sizes of the files
-
-    def look(self) -> list[Event]:
-        """What changed: the summary, and new rows."""
-        events = []
-        try:
-            files = [
-                check_file(self._folder / "run.json", RECORD_BYTES),
-                check_file(self._folder / "history.csv", HISTORY_BYTES),
-                check_file(self._folder / "champion.npz", CHAMPION_BYTES),
-            ]
-            marks = tuple(None if f is None else (f.st_mtime_ns, f.st_size, f.st_ino) for f in files)
-            if marks != self._marks or (self.summary is not None and self.summary.status == "running"):
-                events = self._read(files, marks)
-        except InvalidInput as error:
-            self._fail(str(error).replace(f"{self._folder}{os.sep}", ""))
-        except Exception as error:  # a stranger's file, whatever is wrong with it: the others are shown
-            self._fail(f"cannot be read; got {type(error).__name__}: {describe(error)}")
-        return events
-
-    def _fail(self, problem: str) -> None:
-        self.summary, self.problem, self._marks = None, describe_long(problem), (None, None, None)
-        self._offset, self._row = 0, None
-
-    def _read(self, files: list[os.stat_result | None], marks: tuple[Any, ...]) -> list[Event]:
-        rows: list[Row] = []
-        if self._record is None or marks[0] != self._marks[0]:
-            self._record = _read_record(self._folder / "run.json")
-        if marks[1] != self._marks[1]:
-            rows = self._read_history(files[1], self._marks[1] and marks[1] and marks[1][2] == self._marks[1][2])
-        if marks[2] != self._marks[2]:
-            check_arrays(self._folder / "champion.npz")
-            self._kept, solved = _read_champion(self._folder / "champion.npz")
-            self._solved = None if self._record.task.end is None else solved
-        known = self.summary is not None
-        self._marks, self.problem = marks, None
-        summary = self._summarise(max(f.st_mtime for f in files if f is not None))
-        events = [Event("run", summary)] if summary != self.summary else []
-        self.summary = summary
-        if rows and known:
-            events.append(Event("rows", {"path": self._path, "rows": rows, "first": rows[0][0] - 1}))
-        return events
-
-    def _read_history(self, found: os.stat_result | None, same: bool) -> list[Row]:
-        """The new rows; of a history that was not seen before, or was written anew, the last one."""
-        if found is None:
-            self._offset, self._row = 0, None
-            return []
-        with open(self._folder / "history.csv", "rb") as file:
-            more = found.st_size - self._offset
-            anew = not (same and self._offset and 0 <= more <= NEWS_BYTES)
-            if anew:
-                header = ",".join(COLUMNS).encode() + b"\n"
-                if (begin := file.read(len(header))) != header[: len(begin)]:
-                    raise InvalidInput(f"history.csv: expected the columns {', '.join(COLUMNS)}")
-                self._row, self._offset = None, max(len(header), found.st_size - TAIL_BYTES)
-            file.seek(self._offset - 1)
-            before, data = file.read(1), file.read(max(found.st_size - self._offset, 0))
-        whole = data[: data.rfind(b"\n") + 1]
-        self._offset += len(whole)
-        lines = whole.decode("ascii", "replace").splitlines()
-        if anew:
-            lines = lines[-1:] if len(lines) > 1 or before == b"\n" else []
-        rows = [_parse(line) for line in lines]
-        self._row = rows[-1] if rows else self._row
-        return rows
-
-    def _summarise(self, modified: float) -> RunSummary:
-        record, row = self._record, self._row
-        assert record is not None
-        status = record.status
-        if status == "running" and time.time() - modified > max(QUIET, 5 * _pace(row)):
-            status = "interrupted"  # it was killed, or it would write
-        recipe = record.settings.recipe or {}
-        change = {
-            name: v for name, v in recipe.items() if name not in ("name", "body", "condition", "seed", "controller")
-        }
-        return RunSummary(
-            path=self._path,
-            name=describe(record.task.name),
-            body=_size(record),
-            condition=describe(record.task.condition),
-            controller=describe(record.task.controller.type).lower(),
-            strategy=describe(record.settings.strategy),
-            seed=record.settings.seed,
-            change=describe(", ".join(f"{name}={value}" for name, value in change.items())),
-            unit="m/s" if record.task.fitness in ("progress", "distance", "elapsed") else "",
-            fitness=record.result.fitness if row is None else row[2],
-            robust=record.result.robust_fitness,
-            solved=self._solved,
-            kept=self._kept,
-            status=status,
-            note=None if record.note is None else describe_long(record.note),
-            generation=0 if row is None else row[0],
-            evaluations=0 if row is None else row[1],
-            budget=record.settings.evaluations,
-            sigma=record.settings.sigma if row is None else row[4],
-            modified=modified,
-        )
-
-
-def _read_record(path: Path) -> _Record:
-    try:
-        record = msgspec.json.decode(path.read_bytes(), type=_Record)
-    except OSError as error:
-        raise InvalidInput("run.json: expected a file that can be read", error.strerror) from None
-    except msgspec.ValidationError as error:
-        raise InvalidInput(f"run.json: {error}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InvalidInput("run.json: expected JSON", describe(error)) from None
-    if record.format != FORMAT:
-        raise InvalidInput(f"run.json: expected a run of format {FORMAT}", f"format {describe(record.format)}")
-    if max(abs(record.settings.seed), abs(record.settings.evaluations)) > LARGEST_INTEGER:
-        raise InvalidInput("run.json: expected a seed and evaluations up to 2^53")
-    return record
-
-
-def _parse(line: str) -> Row:
-    """A row of a history; raises `InvalidInput`."""
-    try:
-        generation, evaluations, *numbers = line.split(",")
-        best, median, sigma, seconds = (float(number) for number in numbers)
-        row = int(generation), int(evaluations), best, median, sigma, seconds
-        if 0 < row[0] <= row[1] <= LARGEST_INTEGER:
-            return row
-    except ValueError:
-        pass
-    raise InvalidInput("history.csv: expected rows of six numbers", describe(line))
-
-
-def check_arrays(path: Path) -> None:
-    """Raises `InvalidInput` for a .npz file that is no plain one, or whose arrays would take too much memory."""
-    if check_file(path, CHAMPION_BYTES) is None:
-        return
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            declared = sum(member.file_size for member in members)
-            for member in members if declared <= CHAMPION_BYTES else []:
-                declared = max(declared, _array_bytes(archive, member))
-    except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile) as error:
-        raise InvalidInput(f"{path.name}: expected arrays written by turgor", describe(error)) from None
-    if declared > CHAMPION_BYTES:
-        most = f"{CHAMPION_BYTES / 1e6:.0f} MB"
-        raise InvalidInput(f"{path.name}: expected at most {most} of arrays", f"{declared / 1e6:.0f} MB")
-
-
-def _array_bytes(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
-    """The memory that an array of a .npz file would take, by its header."""
-    with archive.open(member) as file:
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        version = np.lib.format.read_magic(file)
-        if version not in read:
-            raise ValueError(f"an array of format {version}")
-        shape, _, dtype = read[version](file)
-    return math.prod(int(n) for n in shape) * dtype.itemsize
-
-
-def _read_champion(path: Path) -> tuple[float | None, bool | None]:
-    """The champion's fitness and whether it solved its task; None where the file does not tell."""
-    if not path.exists():
-        return None, None
-    with np.load(path, allow_pickle=False) as arrays:
-        found = {name: arrays[name].item() for name in ("fitness", "solved") if name in arrays.files}
-    fitness, solved = found.get("fitness"), found.get("solved")
-    return None if fitness is None else float(fitness), None if solved is None else bool(solved)
-
-
 def _thinned(run: Run) -> dict[str, np.ndarray]:
     """The columns of the history, of a very long one rows at equal distances, the last among them."""
     count = run.generation
@@ -504,28 +245,6 @@ def _solved_starts(run: Run) -> int | None:
     if champion is None or champion.robust_solved is None or run.task.end is None:
         return None
     return int(np.sum(champion.robust_solved))
-
-
-def _size(record: _Record) -> str:
-    """The name of the body's size, by the recipe or, where there is none, by masses and gas."""
-    recipe, body = record.settings.recipe or {}, record.task.body
-    if isinstance(recipe.get("body"), str) and recipe["body"] in SIZES:
-        return recipe["body"]
-    for name, size in SIZES.items():
-        if len(body.position) == size["mass_count"] and body.gas_amount == [size["gas_amount"]]:
-            return name
-    return "custom"
-
-
-def _pace(row: Row | None) -> float:
-    """Mean time of a generation [s]."""
-    return 0.0 if row is None else min(row[5] / row[0], 3600.0)
-
-
-def describe_long(text: str) -> str:
-    """`text` in one line of at most 300 characters."""
-    line = " ".join(text.split())
-    return line if len(line) <= 300 else line[:297] + "..."
 
 
 def _below(path: str, folder: str) -> bool:

@@ -33,7 +33,8 @@ from starlette.websockets import WebSocket
 
 from turgor.errors import InvalidInput, describe
 from turgor.web.guard import Guard, Refused, check_file, inside, is_loopback
-from turgor.web.library import CHAMPION_BYTES, RECORD_BYTES, Event, Library, describe_long
+from turgor.web.library import Library
+from turgor.web.watch import CHAMPION_BYTES, RECORD_BYTES, Event, describe_long
 
 STATIC = Path(__file__).parent / "static"
 INTERVAL = 0.7  # [s] between two looks at the folder
