@@ -34,10 +34,10 @@ class World:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.columns = self.cut(task.scene)
-        self.kernel = make_kernel(task, room_for([self.columns]))
+        columns = self.cut(task.scene)
+        self.kernel = make_kernel(task, room_for([columns]))
         self.grounds = aligned(1, self.kernel.size(Ground))
-        write_ground(ground_tables(self.kernel, self.grounds[0]), self.columns)
+        write_ground(ground_tables(self.kernel, self.grounds[0]), columns)
 
     def cut(self, scene: Scene) -> Columns:
         """The columns of a `scene` for the task's body."""
