@@ -12,8 +12,10 @@ not allocate more than `MEMORY` beyond what it has when it starts.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import faulthandler
 import json
+import logging
 import multiprocessing
 import sys
 import time
@@ -26,8 +28,8 @@ SLOWEST = 5.0  # [s]
 MEMORY = 1_000_000_000  # [byte]
 # of 100 inputs, what each target gets
 SHARES = {
-    "run.json": 14, "history.csv": 8, "champion.npz": 10, "checkpoint.npz": 8, "command": 8, "message": 22, "visit": 0.3,
-    "request": 3.7, "task": 14, "replay": 4, "theta": 8,
+    "run.json": 14, "history.csv": 8, "champion.npz": 10, "checkpoint.npz": 8, "command": 8, "message": 24,
+    "visit": 0.3, "request": 1.7, "task": 14, "replay": 4, "theta": 8,
 }  # fmt: skip
 
 
@@ -38,6 +40,7 @@ def work(name: str, seed: int, first: int, last: int, place: str) -> None:
 
     target, folder = TARGETS[name], Path(place)
     warnings.simplefilter("error")
+    logging.disable()  # what is taken from elsewhere is told in lines
     corpus()
     for k in range(3):  # whatever is loaded or compiled once
         _quietly(try_input, target, input_of(target, -1, k))
@@ -45,9 +48,9 @@ def work(name: str, seed: int, first: int, last: int, place: str) -> None:
     counts = {"inputs": 0, "accepted": 0, "refused": 0, "slowest": 0.0, "slowest_input": 0, "peak": 0}
     log = open(folder / f"{name}.log", "a", encoding="utf-8")  # noqa: SIM115
     for k in range(first, last):
+        (folder / f"{name}.at").write_text(str(k))
         data = input_of(target, seed, k)
         (folder / f"{name}.now").write_bytes(data)
-        (folder / f"{name}.at").write_text(str(k))
         faulthandler.dump_traceback_later(4 * SLOWEST, exit=True, file=log)
         began = time.perf_counter()
         try:
@@ -64,15 +67,14 @@ def work(name: str, seed: int, first: int, last: int, place: str) -> None:
         if k % 50 == 0 or k == last - 1:
             counts["peak"] = max(counts["peak"], _peak())
             (folder / f"{name}-{first}.counts").write_text(json.dumps(counts))
+    log.close()
     if counts["peak"] > MEMORY:
         _keep(folder, name, last, b"", f"memory of {counts['peak'] / 1e6:.0f} MB")
 
 
 def _quietly(call: Any, *arguments: Any) -> None:
-    try:
+    with contextlib.suppress(Exception):  # tried again where it counts
         call(*arguments)
-    except Exception:
-        pass  # tried again where it counts
 
 
 def _limit_memory() -> None:
@@ -110,8 +112,8 @@ def fuzz(name: str, seed: int, inputs: int, folder: Path) -> dict[str, Any]:
         if process.exitcode == 0:
             break
         at = folder / f"{name}.at"
-        k = int(at.read_text()) if at.exists() else first
-        if not at.exists():
+        k = int(at.read_text()) if at.exists() else -1
+        if k < first:
             raise SystemExit(f"{name}: could not start")
         _keep(folder, name, k, (folder / f"{name}.now").read_bytes(), f"ended the process: {process.exitcode}")
         first = k + 1
@@ -141,7 +143,9 @@ def main() -> int:
     names = options.only or list(SHARES)
     total = sum(SHARES[name] for name in names)
     failed = 0
-    print(f"{'target':<15}{'inputs':>8}{'refused':>9}{'accepted':>9}{'slowest [ms]':>14}{'peak [MB]':>11}{'failures':>10}")
+    print(
+        f"{'target':<15}{'inputs':>8}{'refused':>9}{'accepted':>9}{'slowest [ms]':>14}{'peak [MB]':>11}{'failures':>10}"
+    )
     for name in names:
         found = fuzz(name, options.seed, round(options.inputs * SHARES[name] / total), options.out)
         failed += found["failures"]

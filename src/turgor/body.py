@@ -13,10 +13,12 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from turgor.arrays import LARGEST, LARGEST_COORDINATE, SMALLEST, as_numbers
 from turgor.errors import InvalidInput, describe
 
 GAS_CONSTANT = 8.314462618  # J/(mol K), exact since 2019
 MINIMUM_MASSES = 3
+MOST_MASSES = 1000  # pairs of them grow with the square
 
 
 class Body(msgspec.Struct, frozen=True, eq=False, kw_only=False):
@@ -44,6 +46,9 @@ class Body(msgspec.Struct, frozen=True, eq=False, kw_only=False):
         put = msgspec.structs.force_setattr
         position = _array("position", self.position, (None, 2))
         count = len(position)
+        if count > MOST_MASSES or not (np.abs(position) <= LARGEST_COORDINATE).all():
+            expected = f"position: expected at most {MOST_MASSES} masses within {LARGEST_COORDINATE:g} m"
+            raise InvalidInput(expected, f"{count} masses" if count > MOST_MASSES else "one that is further away")
         springs = _indices("springs", self.springs, count)
         chambers = _loops(self.chambers, count)
         put(self, "position", position)
@@ -53,19 +58,15 @@ class Body(msgspec.Struct, frozen=True, eq=False, kw_only=False):
         put(self, "side", _positive("side", _per("side", self.side, count)))
         put(self, "density", _positive("density", _per("density", self.density, count)))
         put(self, "gas_amount", _per("gas_amount", self.gas_amount, len(chambers)))
-        put(self, "friction", float(self.friction))
-        if (self.gas_amount < 0).any():
-            raise InvalidInput("gas_amount: expected 0 mol or more", describe(self.gas_amount.min()))
-        if not (math.isfinite(self.friction) and self.friction >= 0):
-            raise InvalidInput("friction: expected a finite number, 0 or more", describe(self.friction))
+        put(self, "friction", float(_not_negative("friction", _array("friction", self.friction, ()))))
+        _not_negative("gas_amount", self.gas_amount)
         distance = np.linalg.norm(position[springs[:, 1]] - position[springs[:, 0]], axis=1)
         rest = distance if self.rest_length is None else _per("rest_length", self.rest_length, len(springs))
         put(self, "rest_length", _frozen(_positive("rest_length", rest)))
         for name in ("frequency", "damping_ratio", "shortest", "longest"):
             values = _per(name, getattr(self, name), len(springs))
             put(self, name, values if name == "damping_ratio" else _positive(name, values))
-        if (self.damping_ratio < 0).any():
-            raise InvalidInput("damping_ratio: expected 0 or more", describe(self.damping_ratio.min()))
+        _not_negative("damping_ratio", self.damping_ratio)
         if (self.shortest > 1).any() or (self.longest < 1).any():
             raise InvalidInput(
                 "shortest, longest: expected shortest <= 1 <= longest",
@@ -134,10 +135,13 @@ def ring(
     spring i joins masses i and i + 1. `gas_amount` in mol, `radius` in m; `elements` are the other fields
     of `Body`. Source: Pigozzi 2022, and its program for the turned squares.
     """
-    if not isinstance(mass_count, int | np.integer) or mass_count < MINIMUM_MASSES:
-        raise InvalidInput(f"mass_count: expected a whole number, at least {MINIMUM_MASSES}", describe(mass_count))
-    if not (isinstance(radius, int | float | np.number) and math.isfinite(radius) and radius > 0):
-        raise InvalidInput("radius: expected a positive number of metres", describe(radius))
+    if not isinstance(mass_count, int | np.integer) or not MINIMUM_MASSES <= mass_count <= MOST_MASSES:
+        expected = f"mass_count: expected a whole number, {MINIMUM_MASSES} to {MOST_MASSES}"
+        raise InvalidInput(expected, describe(mass_count))
+    if not (isinstance(radius, int | float | np.number) and 0 < radius <= LARGEST_COORDINATE):
+        raise InvalidInput(
+            f"radius: expected a positive number of metres, up to {LARGEST_COORDINATE:g}", describe(radius)
+        )
     index = np.arange(mass_count)
     angle = 2 * np.pi * index / mass_count
     return Body(
@@ -159,10 +163,7 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 
 
 def _array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidInput(f"{name}: expected numbers", describe(value)) from None
+    array = as_numbers(name, value)
     if array.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, array.shape, strict=True)):
         raise InvalidInput(f"{name}: expected shape {_shape(shape)}", f"shape {_shape(array.shape)}")
     if not np.isfinite(array).all():
@@ -175,26 +176,38 @@ def _shape(shape: Sequence[int | None]) -> str:
 
 
 def _per(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    if np.ndim(value) == 0:
-        value = np.full(count, value)
-    return _array(name, value, (count,))
+    array = as_numbers(name, value)
+    return _array(name, np.full(count, array) if array.ndim == 0 else array, (count,))
 
 
 def _positive(name: str, array: np.ndarray) -> np.ndarray:
-    if (array <= 0).any():
-        raise InvalidInput(f"{name}: expected positive numbers", describe(array.min()))
+    wrong = array[~((array >= SMALLEST) & (array <= LARGEST))]
+    if wrong.size:
+        raise InvalidInput(f"{name}: expected positive numbers, {SMALLEST:g} to {LARGEST:g}", describe(wrong[0]))
+    return array
+
+
+def _not_negative(name: str, array: np.ndarray) -> np.ndarray:
+    wrong = array[~((array >= 0) & (array <= LARGEST))]
+    if wrong.size:
+        raise InvalidInput(f"{name}: expected a finite number, 0 or more, up to {LARGEST:g}", describe(wrong[0]))
     return array
 
 
 def _indices(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    array = _array(name, np.reshape(np.asarray(value, dtype=np.float64), (-1, 2)), (None, 2)).astype(np.int64)
-    if array.size and (array.min() < 0 or array.max() >= count or (array[:, 0] == array[:, 1]).any()):
-        raise InvalidInput(f"{name}: expected pairs of different masses, 0 to {count - 1}", describe(array.tolist()))
-    return _frozen(array)
+    array = as_numbers(name, value)
+    array = array.reshape(-1, 2) if array.size % 2 == 0 else array
+    expected = f"{name}: expected pairs of different masses, 0 to {count - 1}"
+    if array.ndim != 2 or not ((array >= 0) & (array < count)).all() or (array[:, 0] == array[:, 1]).any():
+        raise InvalidInput(expected, describe(array.tolist()))
+    return _frozen(array.astype(np.int64))
 
 
 def _loops(value: Sequence[Sequence[int]], count: int) -> tuple[tuple[int, ...], ...]:
-    loops = tuple(tuple(int(i) for i in loop) for loop in value)
+    try:
+        loops = tuple(tuple(int(i) for i in loop) for loop in value)
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidInput("chambers: expected loops of masses", describe(value)) from None
     for loop in loops:
         if len(loop) < MINIMUM_MASSES or len(set(loop)) != len(loop) or min(loop) < 0 or max(loop) >= count:
             raise InvalidInput(

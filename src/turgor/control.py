@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from turgor.arrays import as_numbers
 from turgor.body import Body
 from turgor.errors import InvalidInput, describe, one_of
 from turgor.variants import Condition
@@ -199,10 +200,7 @@ def rows(theta: np.ndarray, body: Body, condition: Condition) -> tuple[np.ndarra
 def check_theta(theta: ArrayLike, body: Body, condition: Condition, controller: Controller = LINEAR) -> np.ndarray:
     """`theta` as float64 [agent, parameter]; raises `InvalidInput` for another shape, NaN or infinity."""
     count = parameter_count(body, condition, controller)
-    try:
-        array = np.asarray(theta, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidInput(f"theta: expected numbers of shape [agent, {count}]", describe(theta)) from None
+    array = as_numbers("theta", theta)
     if array.ndim != 2 or array.shape[1] != count:
         hint = " (for one agent: theta[None])" if array.shape == (count,) else ""
         raise InvalidInput(f"theta: expected shape [agent, {count}]{hint}", f"shape {list(array.shape)}")

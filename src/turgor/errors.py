@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+LONGEST = 1000  # characters of an error
+LARGEST_INTEGER = 2**53  # that files, tables and pages can hold
+
 
 class InvalidInput(ValueError):
     """Something from outside is not what was expected."""
 
     def __init__(self, expected: str, got: str | None = None) -> None:
-        super().__init__(expected if got is None else f"{expected}; got {got}")
+        line = " ".join((expected if got is None else f"{expected}; got {got}").splitlines())
+        super().__init__(line if len(line) <= LONGEST else line[: LONGEST - 3] + "...")
 
 
 def describe(value: object) -> str:

@@ -10,6 +10,7 @@ import logging
 import math
 import os
 import socket
+import stat
 import zipfile
 from collections.abc import Generator, Mapping
 from pathlib import Path
@@ -22,6 +23,7 @@ from turgor.errors import InvalidInput, describe
 LOCK = ".lock"
 PARTIALS = ".*.partial*"  # files that were being written
 DIGEST = "sha256"  # the array that holds the checksum of the others
+ARRAYS_BYTES = 500_000_000  # larger files of arrays are not read
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 log = logging.getLogger("turgor")
@@ -67,6 +69,16 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def read_whole(path: Path, most: int) -> bytes:
+    """What a plain file of at most `most` bytes holds. Raises `InvalidInput` for another, and `OSError`."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise InvalidInput(f"{path}: expected a file", "something else")
+    if found.st_size > most:
+        raise InvalidInput(f"{path}: expected at most {most / 1e6:.0f} MB", f"{found.st_size / 1e6:.0f} MB")
+    return path.read_bytes()
+
+
 # --- arrays -------------------------------------------------------------------------------------------------------
 
 
@@ -86,11 +98,12 @@ def read_arrays(path: Path, *, checksum: bool = True) -> dict[str, np.ndarray]:
     takes a file without a checksum as well.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            _check_members(archive, path.stat().st_size)
+        data = read_whole(path, ARRAYS_BYTES)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            _check_members(archive, len(data))
             arrays = {m.filename.removesuffix(".npy"): _read_array(archive, m) for m in archive.infolist()}
     except Exception as error:  # zipfile and NumPy stumble over a stranger's bytes in many ways
-        if isinstance(error, MemoryError):
+        if isinstance(error, MemoryError | InvalidInput):
             raise
         reason = describe(getattr(error, "strerror", None) or error)
         raise InvalidInput(f"{path}: expected arrays written by turgor", reason) from None

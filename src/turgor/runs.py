@@ -20,6 +20,7 @@ import csv
 import hashlib
 import importlib.metadata
 import io
+import math
 import os
 import platform
 import sys
@@ -29,8 +30,8 @@ from typing import Any, Literal, TextIO
 import msgspec
 import numpy as np
 
-from turgor.errors import InvalidInput, describe
-from turgor.files import FolderLock, is_left_over, log, read_arrays, write_arrays, write_whole, writing
+from turgor.errors import LARGEST_INTEGER, InvalidInput, describe
+from turgor.files import FolderLock, is_left_over, log, read_arrays, read_whole, write_arrays, write_whole, writing
 from turgor.task import Task, task_from_json, task_to_json
 
 FORMAT = 2  # 1: without checksums, and without the history in the checkpoint
@@ -39,6 +40,16 @@ RECORD, HISTORY, CHAMPION = "run.json", "history.csv", "champion.npz"
 CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint.previous.npz"
 COLUMNS = ("generation", "evaluations", "best", "median", "sigma", "seconds")
 PACKAGES = ("turgor", "numpy", "numba", "cma")
+
+MOST_REPEATS = 100_000
+_RANGES = {
+    "evaluations": (1, LARGEST_INTEGER),
+    "seed": (0, LARGEST_INTEGER),
+    "population": (1, LARGEST_INTEGER),
+    "threads": (1, LARGEST_INTEGER),
+    "robust_repeats": (1, MOST_REPEATS),
+}
+RECORD_BYTES, HISTORY_BYTES = 50_000_000, 200_000_000  # larger files are not read
 
 Row = tuple[int, int, float, float, float, float]
 Status = Literal["running", "done", "interrupted", "failed"]
@@ -55,6 +66,14 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     sigma: float | None = None  # of the strategy at the start [1]; None: its default
     robust_repeats: int = 30
     recipe: dict[str, Any] | None = None  # arguments of `make_task`, where known
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+                raise InvalidInput(f"{name}: expected a whole number, {low} to {high}", describe(value))
+        if self.sigma is not None and not 0 < self.sigma < math.inf:
+            raise InvalidInput("sigma: expected a positive number", describe(self.sigma))
 
 
 class Champion(msgspec.Struct, frozen=True, eq=False, kw_only=True):
@@ -420,7 +439,7 @@ def _read_record(folder: Path) -> Record:
         kind = "a file" if folder.exists() else "nothing there"
         raise InvalidInput(f"{folder}: expected the folder of a run", kind)
     try:
-        raw = msgspec.json.decode(path.read_bytes())
+        raw = msgspec.json.decode(read_whole(path, RECORD_BYTES))
     except FileNotFoundError:
         raise InvalidInput(f"{folder}: expected the folder of a run", f"no {RECORD} in it") from None
     except OSError as error:
@@ -447,7 +466,7 @@ def _checksum(fields: dict[str, Any]) -> str:
 def _read_history(path: Path) -> list[Row]:
     """The rows of history.csv; a last line without an end was being written, and is left out."""
     try:
-        lines = path.read_bytes().decode("ascii").split("\n")
+        lines = read_whole(path, HISTORY_BYTES).decode("ascii").split("\n")
         found = list(csv.reader(lines[:-1]))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InvalidInput(f"{path}: expected a table in ASCII", getattr(error, "strerror", None) or "else") from None
@@ -495,7 +514,18 @@ def _champion(arrays: dict[str, np.ndarray], prefix: str, task: Task, path: Path
         value = fields.get(name, np.zeros(0))
         if value.shape:
             raise InvalidInput(f"{path}: expected one number in {prefix}{name}", f"shape {list(value.shape)}")
-        fields[name] = value.item()
+        if value.dtype.kind not in "biuf":
+            raise InvalidInput(f"{path}: expected a number in {prefix}{name}", str(value.dtype))
+        if name != "fitness" and not 0 <= value <= LARGEST_INTEGER:
+            raise InvalidInput(f"{path}: expected 0 or more in {prefix}{name}", describe(value))
+        fields[name] = {"fitness": float, "solved": bool}.get(name, int)(value)
+    for name in ("robust", "robust_solved"):
+        value = fields.get(name)
+        if value is not None and (
+            value.ndim != 1 or not 0 < len(value) <= MOST_REPEATS or value.dtype.kind not in "biuf"
+        ):
+            found = f"{value.dtype} {list(value.shape)}"
+            raise InvalidInput(f"{path}: expected numbers of shape [repeat] in {prefix}{name}", found)
     if not (np.isfinite(theta).all() and np.isfinite(fields["fitness"])):
         raise InvalidInput(f"{path}: expected finite numbers in {prefix}theta and {prefix}fitness", "NaN or infinity")
     return Champion(**fields)

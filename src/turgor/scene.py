@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import random
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from turgor.arrays import LARGEST, LARGEST_COORDINATE, as_numbers
 from turgor.errors import InvalidInput, describe
 
 GROUND_DEPTH = 2.0  # [m]: ground pushes out whatever lies this far beneath it
 WALL_HEIGHT = 100.0  # [m]: walls at the ends of a terrain, from -WALL_HEIGHT to WALL_HEIGHT
 PLANE_EXTENT = 500.0  # [m]: half length of the plane
-LARGEST_COORDINATE = 1e6  # [m]: beyond it float32 cannot tell 6 cm apart
+MOST_SEGMENTS = 100_000
 
 
 class Scene(msgspec.Struct, frozen=True, eq=False):
@@ -30,26 +30,33 @@ class Scene(msgspec.Struct, frozen=True, eq=False):
 
     def __post_init__(self) -> None:
         try:
-            segments = np.array(self.segments, dtype=np.float64).reshape(-1, 4)
-            depth = np.broadcast_to(np.asarray(self.depth, dtype=np.float64), len(segments)).copy()
-        except (TypeError, ValueError):
+            segments = np.array(as_numbers("segments", self.segments)).reshape(-1, 4)
+            depth = np.broadcast_to(as_numbers("depth", self.depth), len(segments)).copy()
+            friction = float(self.friction)
+        except InvalidInput:
+            raise
+        except (TypeError, ValueError, OverflowError):
             raise InvalidInput(
                 "segments: expected numbers of shape [segment, 4], depth: one or one per segment",
                 f"{describe(self.segments)} and {describe(self.depth)}",
             ) from None
+        if len(segments) > MOST_SEGMENTS:
+            raise InvalidInput(f"segments: expected at most {MOST_SEGMENTS}", str(len(segments)))
         if not (np.abs(segments) <= LARGEST_COORDINATE).all():
             raise InvalidInput(f"segments: expected coordinates within {LARGEST_COORDINATE:g} m", "larger or NaN")
         length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
         if (length < 1e-3).any():
             raise InvalidInput("segments: expected two different ends", describe(segments[length.argmin()]))
-        if not (depth >= 0).all():
-            raise InvalidInput("depth: expected 0 m or more", describe(depth))
-        if not (math.isfinite(self.friction) and self.friction >= 0):
-            raise InvalidInput("ground friction: expected a finite number, 0 or more", describe(self.friction))
+        if not ((depth >= 0) & (depth <= LARGEST_COORDINATE)).all():
+            raise InvalidInput(f"depth: expected 0 m or more, up to {LARGEST_COORDINATE:g} m", describe(depth))
+        if not 0 <= friction <= LARGEST:
+            raise InvalidInput(
+                f"ground friction: expected a finite number, 0 or more, up to {LARGEST:g}", describe(self.friction)
+            )
         segments.flags.writeable = depth.flags.writeable = False
         msgspec.structs.force_setattr(self, "segments", segments)
         msgspec.structs.force_setattr(self, "depth", depth)
-        msgspec.structs.force_setattr(self, "friction", float(self.friction))
+        msgspec.structs.force_setattr(self, "friction", friction)
 
     def __repr__(self) -> str:
         if not len(self.segments):
@@ -112,6 +119,10 @@ def hills(
         if x > extent:
             break
         vertices.append((x, next_height()))
+        if len(vertices) >= MOST_SEGMENTS:
+            raise InvalidInput(
+                f"hills: expected fewer than {MOST_SEGMENTS} vertices, by a smaller extent", f"{extent:g} m"
+            )
     return polyline(np.array(vertices), friction=friction)
 
 

@@ -14,16 +14,20 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from turgor.arrays import as_numbers
 from turgor.body import Body
 from turgor.control import check_theta, observation_count, output_count
 from turgor.errors import InvalidInput, describe
 from turgor.physics.batch import Batch, World, load_kernel
+from turgor.physics.memory import BYTES, MOST_BYTES, check_memory
 from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH
 from turgor.recording import Recording
 from turgor.scene import LARGEST_COORDINATE, Scene
 from turgor.task import Physics, Task, given_rows, start_position
 
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
+MOST_THREADS = 1024
+LARGEST_PUSH = 1e9  # [m/s]
 
 
 class Rollout(msgspec.Struct, frozen=True, eq=False, kw_only=True):
@@ -72,8 +76,8 @@ class Simulator:
 
     def __init__(self, task: Task, *, threads: int | None = None) -> None:
         """`threads`: None for all cores. Raises `InvalidInput` for fewer than 1."""
-        if threads is not None and (not isinstance(threads, int) or threads < 1):
-            raise InvalidInput("threads: expected a whole number, at least 1", describe(threads))
+        if threads is not None and (not isinstance(threads, int) or not 1 <= threads <= MOST_THREADS):
+            raise InvalidInput(f"threads: expected a whole number, 1 to {MOST_THREADS}", describe(threads))
         self.task = task
         self.threads = threads or available_cores()
         self._world = World(task)
@@ -98,15 +102,16 @@ class Simulator:
             batch.think(theta[part])
             final[part], steps[part], solved[part] = self._run_whole(batch)
 
-        self._spread(run, _parts(len(theta), self.threads))
+        most = max(1, min(BLOCKS_AT_ONCE, MOST_BYTES // self._world.kernel.block_bytes))
+        self._spread(run, _parts(len(theta), self.threads, most))
         return self._judge(starts, final, steps, solved)
 
     def record(self, theta: ArrayLike, position: ArrayLike | None = None) -> Recording:
         """The `Recording` of one controller, `theta` [parameter], from the task's start or from `position`
         [mass, 2]: the same steps that `rollout` takes."""
-        theta = np.reshape(np.asarray(theta), (1, -1))
+        theta = np.reshape(as_numbers("theta", theta), (1, -1))
         theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
-        starts = self._starts(1, None if position is None else np.asarray(position)[None])
+        starts = self._starts(1, None if position is None else as_numbers("position", position)[None])
         batch = Batch(self._world, starts)
         batch.think(theta)
         trace = batch.trace(self.task.steps)
@@ -138,7 +143,7 @@ class Simulator:
         `Step` of theirs, to be written over in place of a new one."""
         out = self._room_for_step("step", out)
         shape = (len(out.stand), output_count(self.task.body, self.task.condition))
-        commands = np.ascontiguousarray(commands, dtype=np.float32)
+        commands = np.ascontiguousarray(as_numbers("commands", commands, np.float32))
         if commands.shape != shape:
             raise InvalidInput(f"commands: expected shape {list(shape)}", f"shape {list(commands.shape)}")
         if not np.isfinite(commands).all():
@@ -161,11 +166,11 @@ class Simulator:
             raise InvalidInput("push: expected agents at the start; call reset first")
         shape = (self._stepping[-1][1].stop, self.task.body.mass_count, 2)
         expected = f"change: expected finite numbers of shape {list(shape)}"
-        given = np.asarray(change, dtype=np.float64)
+        given = as_numbers("change", change)
         if given.shape != shape:
             raise InvalidInput(expected, f"shape {list(given.shape)}")
-        if not (np.abs(given) <= np.finfo(np.float32).max).all():
-            raise InvalidInput(expected, "NaN, infinity or too large")
+        if not (np.abs(given) <= LARGEST_PUSH).all():
+            raise InvalidInput(expected, f"NaN, infinity or too large: beyond {LARGEST_PUSH:g} m/s")
         for batch, mine in self._stepping:
             batch.push(given[mine].astype(np.float32))
 
@@ -220,6 +225,8 @@ class Simulator:
         task = self.task
         drive, script = CONTROLLER, None
         if task.pressure is not None:
+            columns = task.body.spring_count + task.body.chamber_count
+            check_memory("steps: expected fewer with a given pressure", BYTES * WIDTH * task.steps * columns)
             lengths = np.repeat(task.body.rest_length[None], task.steps, axis=0)
             drive, script = REPLAY, np.concatenate([lengths, task.pressure], axis=1)
         if callable(task.end):
@@ -262,7 +269,7 @@ class Simulator:
         shape = (agents, self.task.body.mass_count, 2)
         if position is None:
             return np.broadcast_to(self.task.position.astype(np.float32), shape)
-        starts = np.asarray(position, dtype=np.float64)
+        starts = as_numbers("position", position)
         if starts.shape != shape or not (np.abs(starts) <= LARGEST_COORDINATE).all():
             raise InvalidInput(
                 f"position: expected finite numbers of shape {list(shape)}", f"shape {list(starts.shape)} or too large"
@@ -396,10 +403,10 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _parts(agents: int, threads: int) -> list[slice]:
-    """The batch cut evenly: for every thread a part, as long as that fills lanes, and none too large."""
+def _parts(agents: int, threads: int, most: int = BLOCKS_AT_ONCE) -> list[slice]:
+    """The batch cut evenly: for every thread a part, as long as that fills lanes, none of more than `most` blocks."""
     blocks = -(-agents // WIDTH)
-    return _cut(agents, max(min(threads, blocks), -(-blocks // BLOCKS_AT_ONCE)))
+    return _cut(agents, max(min(threads, blocks), -(-blocks // most)))
 
 
 def _cut(agents: int, parts: int) -> list[slice]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from turgor import body as bodies
 from turgor import scene as scenes
+from turgor.arrays import as_numbers
 from turgor.body import GAS_CONSTANT, Body
 from turgor.control import Condition, Controller, Linear, Sensing, check_body, make_controller, parameter_count
 from turgor.errors import InvalidInput, describe, one_of
@@ -34,6 +35,7 @@ from turgor.variants import (
     variant_names,
 )
 
+LARGEST_PRESSURE_UNIT = 1e15  # [Pa]
 REST_GAP = 0.015  # [m] between the lowest corner and the ground at a resting start
 
 
@@ -78,8 +80,9 @@ class Task(msgspec.Struct, frozen=True, eq=False, kw_only=True):
             raise InvalidInput("steps: expected a whole number, 1 to 10000000", describe(self.steps))
         if isinstance(self.fitness, str) and self.fitness not in get_args(Fitness):
             raise one_of("fitness", get_args(Fitness), self.fitness)
-        if self.pressure_unit is not None and not math.isfinite(self.pressure_unit):
-            raise InvalidInput("pressure_unit: expected a number of Pa", describe(self.pressure_unit))
+        if self.pressure_unit is not None and not abs(self.pressure_unit) <= LARGEST_PRESSURE_UNIT:
+            expected = f"pressure_unit: expected a number of Pa within {LARGEST_PRESSURE_UNIT:g}"
+            raise InvalidInput(expected, describe(self.pressure_unit))
         if self.pressure is not None:
             put(self, "pressure", given_rows("pressure", self.pressure, self.steps, self.body.chamber_count))
         if (self.condition == "pressure" or self.fitness == "area") and not self.body.chamber_count:
@@ -150,7 +153,7 @@ class Task(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 def start_position(position: Any, body: Body) -> np.ndarray:
     """`position` as read-only float64 [mass, 2]; raises `InvalidInput` for another shape or NaN."""
-    array = np.array(position, dtype=np.float64) + 0.0  # + 0.0: no negative zeros
+    array = as_numbers("position", position) + 0.0  # + 0.0: a copy, and no negative zeros
     if array.shape != (body.mass_count, 2) or not (np.abs(array) <= scenes.LARGEST_COORDINATE).all():
         raise InvalidInput(
             f"position: expected finite numbers of shape [{body.mass_count}, 2]",
@@ -162,7 +165,7 @@ def start_position(position: Any, body: Body) -> np.ndarray:
 
 def given_rows(name: str, values: Any, steps: int, count: int) -> np.ndarray:
     """`values` [step] or [step, count] as read-only float64 [step, count]; raises `InvalidInput` otherwise."""
-    array = np.array(values, dtype=np.float64)
+    array = np.array(as_numbers(name, values))
     array = np.repeat(array[:, None], count, axis=1) if array.ndim == 1 else array
     if array.shape != (steps, count) or not np.isfinite(array).all():
         raise InvalidInput(f"{name}: expected finite numbers of shape [{steps}, {count}]", f"shape {list(array.shape)}")
@@ -348,7 +351,10 @@ def task_to_json(task: Task) -> bytes:
 def task_from_json(data: bytes | Mapping[str, Any]) -> Task:
     """The `Task` of `task_to_json`. A fitness or end that is a function of the user's own cannot be read back:
     raises `InvalidInput` and asks for the task itself."""
-    raw = msgspec.json.decode(data) if isinstance(data, bytes) else dict(data)
+    try:
+        raw = msgspec.json.decode(data) if isinstance(data, bytes) else dict(data)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InvalidInput("task: expected JSON", describe(error)) from None
     if not isinstance(raw, dict):
         raise InvalidInput("task: expected a JSON object", describe(raw))
     for name in ("fitness", "end"):

@@ -6,7 +6,6 @@ each field: the only list there is. No NumPy in here, so that help answers at on
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal, get_args
 
 import msgspec
@@ -17,6 +16,16 @@ Condition = Literal["pressure", "springs", "passive"]
 Fitness = Literal["progress", "distance", "elapsed", "area"]
 Observation = Literal["signed", "unit"]
 PressureLength = Literal["true", "commanded"]
+
+
+LARGEST = 1e9  # what a number of the world or of sensing may be, in its unit
+_RANGES = {
+    "dt": (1e-6, 10.0),
+    "temperature": (1e-9, LARGEST),
+    "max_travel": (1e-9, LARGEST),
+    "velocity_iterations": (0, 1000),
+    "position_iterations": (0, 1000),
+}
 
 
 class General(msgspec.Struct, frozen=True):
@@ -56,8 +65,14 @@ class Physics(msgspec.Struct, frozen=True):
             if name == "pressure_length":
                 if value not in get_args(PressureLength):
                     raise one_of(name, get_args(PressureLength), value)
-            elif not math.isfinite(value) or value < 0 or (value == 0 and name in ("dt", "temperature", "max_travel")):
-                raise InvalidInput(f"{name}: expected a number that is not negative", describe(value))
+            elif name in _RANGES:
+                low, high = _RANGES[name]
+                if not low <= value <= high:
+                    raise InvalidInput(f"{name}: expected a number from {low:g} to {high:g}", describe(value))
+            elif not 0 <= value <= LARGEST:
+                raise InvalidInput(
+                    f"{name}: expected a number that is not negative, up to {LARGEST:g}", describe(value)
+                )
 
 
 class Sensing(msgspec.Struct, frozen=True):
@@ -76,8 +91,8 @@ class Sensing(msgspec.Struct, frozen=True):
             raise one_of("observation", get_args(Observation), self.observation)
         for name in ("position_scale", "velocity_scale"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidInput(f"{name}: expected a positive number", describe(value))
+            if not 1e-9 <= value <= LARGEST:
+                raise InvalidInput(f"{name}: expected a positive number, 1e-09 to {LARGEST:g}", describe(value))
 
 
 class Elements(msgspec.Struct, frozen=True):

@@ -40,6 +40,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{error.strerror or error}")
+    except MemoryError:
+        return _fail("expected a smaller task or fewer agents: there is not enough memory")
     except KeyboardInterrupt:
         print("turgor: interrupted", file=sys.stderr)
         return INTERRUPTED

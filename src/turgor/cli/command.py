@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from turgor.cli.words import say
-from turgor.errors import InvalidInput
+from turgor.errors import LARGEST_INTEGER, InvalidInput
 
 
 class Command(NamedTuple):
@@ -38,6 +38,8 @@ class Parser(argparse.ArgumentParser):
 
     def parse(self, argv: list[str]) -> argparse.Namespace:
         """The options in `argv`; raises `InvalidInput`."""
+        if any("\0" in argument for argument in argv):
+            raise InvalidInput(f"{self.prog}: expected text and names of files", "a NUL character")
         options, unknown = self.parse_known_args(argv)
         if unknown:
             name = unknown[0].partition("=")[0]
@@ -100,6 +102,8 @@ def _parsed(kind: Callable[[str], Any], text: str, name: str) -> Any:
         value = kind(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected {name}; got {text!r}") from None
+    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        raise argparse.ArgumentTypeError(f"expected {name} up to 2^53; got {text!r}")
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"expected {name} that is finite; got {text!r}")
     return value

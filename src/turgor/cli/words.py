@@ -13,7 +13,10 @@ if TYPE_CHECKING:
 def say(text: str = "") -> None:
     """Prints a line. Where nobody reads any more, the rest is lost in silence and the work goes on."""
     try:
-        print(text, flush=True)
+        try:
+            print(text, flush=True)
+        except UnicodeEncodeError:  # a name of a file, or a terminal, that is not UTF-8
+            print(text.encode(sys.stdout.encoding, "backslashreplace").decode(sys.stdout.encoding), flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import error, spaces
 from numpy.typing import ArrayLike
 
+from turgor.arrays import as_numbers
 from turgor.body import Body
 from turgor.control import observation_count, output_count
 from turgor.errors import InvalidInput, describe, one_of
@@ -103,8 +104,8 @@ def commands(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     shape, NaN or infinity. What is beyond 1 is cut."""
     expected = f"action: expected finite numbers of shape {list(shape)}, within [-1, 1]"
     try:
-        array = np.asarray(actions, dtype=np.float32)
-    except (TypeError, ValueError):
+        array = as_numbers("action", actions, np.float32)
+    except InvalidInput:
         raise error.InvalidAction(f"{expected}; got {describe(actions)}") from None
     if array.shape != shape:
         raise error.InvalidAction(f"{expected}; got shape {list(array.shape)}")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from turgor.errors import InvalidInput
 from turgor.evolution.strategy import (
     Degenerate,
     check_numbers,
@@ -23,6 +24,7 @@ from turgor.evolution.strategy import (
     set_rng_bits,
 )
 
+MOST_PARAMETERS = 5000  # the covariance is the square of them, 200 MB
 LARGEST_CONDITION = 1e14  # of the covariance: beyond it float64 cannot tell its axes; pycma's own limit
 
 
@@ -60,6 +62,9 @@ class CMAES:
 
         Raises `InvalidInput`.
         """
+        if parameter_count > MOST_PARAMETERS:
+            expected = f"{self.name}: expected at most {MOST_PARAMETERS} parameters; sep-cma-es and lm-ma-es take more"
+            raise InvalidInput(expected, str(parameter_count))
         population, sigma, mean = check_start(parameter_count, rng, population, sigma, mean)
         self._rng = rng
         self._start(mean, sigma, population)

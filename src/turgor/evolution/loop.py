@@ -17,11 +17,12 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from turgor.arrays import as_numbers
 from turgor.errors import InvalidInput, describe
 from turgor.evolution import STRATEGIES
 from turgor.evolution.strategy import Degenerate, Strategy, built_in
 from turgor.files import NotWritten
-from turgor.runs import RECORD, Champion, Run, Settings, current_versions
+from turgor.runs import MOST_REPEATS, RECORD, Champion, Run, Settings, current_versions
 from turgor.simulate import Rollout, Simulator, perturbed
 from turgor.task import Task
 
@@ -147,7 +148,10 @@ def _as_started(settings: Settings, name: str | None) -> MakeStrategy:
 
 def evaluate(simulator: Simulator, theta: ArrayLike, repeats: int = 30, size: float = 1e-6) -> Rollout:
     """A `Rollout` of one controller, `theta` [parameter], from `repeats` starts that differ by `size` [m]."""
-    thetas = np.repeat(np.asarray(theta, dtype=np.float64)[None], repeats, axis=0)
+    if not isinstance(repeats, int) or not 1 <= repeats <= MOST_REPEATS:
+        raise InvalidInput(f"repeats: expected a whole number, 1 to {MOST_REPEATS}", describe(repeats))
+    theta = as_numbers("theta", theta)
+    thetas = np.broadcast_to(theta, (repeats, *theta.shape))
     return simulator.rollout(thetas, perturbed(simulator.task.position, repeats, size))
 
 

@@ -22,6 +22,7 @@ from turgor.evolution import STRATEGIES
 WORST = 1e300  # cost of an agent without a fitness: finite, so that sums stay finite
 SMALLEST_SIGMA = 1e-150  # its square is still a number
 LARGEST_NUMBER = 1e15  # [1], of a controller: what the simulator takes
+MOST_AGENTS, MOST_NUMBERS = 100_000, 20_000_000  # of a generation, and numbers in all of their controllers
 UINT64 = 2**64
 
 
@@ -94,9 +95,10 @@ def check_start(
     if population is None:
         population = default_population(parameter_count)
         population += population % 2 if even else 0
-    if not isinstance(population, int) or population < 4 or (even and population % 2):
+    if not isinstance(population, int) or not 4 <= population <= MOST_AGENTS or (even and population % 2):
         kind = "an even whole number" if even else "a whole number"
-        raise InvalidInput(f"population: expected {kind}, at least 4", describe(population))
+        raise InvalidInput(f"population: expected {kind}, 4 to {MOST_AGENTS}", describe(population))
+    check_generation(population, parameter_count)
     check_positive("sigma", sigma)
     if not isinstance(rng.bit_generator, np.random.PCG64):
         kind = type(rng.bit_generator).__name__
@@ -105,6 +107,13 @@ def check_start(
     if start.shape != (parameter_count,) or not np.isfinite(start).all():
         raise InvalidInput(f"mean: expected {parameter_count} finite numbers", f"shape {list(start.shape)}")
     return population, float(sigma), start
+
+
+def check_generation(population: int, parameter_count: int) -> None:
+    """Raises `InvalidInput` for a generation that takes too much memory."""
+    if population * parameter_count > MOST_NUMBERS:
+        expected = f"population: expected at most {MOST_NUMBERS // parameter_count} for {parameter_count} parameters"
+        raise InvalidInput(expected, describe(population))
 
 
 def check_positive(name: str, value: float) -> None:
@@ -143,8 +152,10 @@ def check_state(name: str, state: Mapping[str, np.ndarray], shapes: Mapping[str,
         kinds = "u" if key == "generator" else "iuf"
         if value.shape != shape or value.dtype.kind not in kinds or not np.isfinite(value).all():
             raise InvalidInput(f"state of {name}: expected finite numbers of shape {list(shape)} in {key}")
-    if not (state["sigma"] > 0 and state["population"] >= 4 and int(state["population"]) == state["population"]):
-        raise InvalidInput(f"state of {name}: expected a positive sigma and a population of at least 4")
+    population = state["population"].item()
+    if not (state["sigma"] > 0 and 4 <= population <= MOST_AGENTS and int(population) == population):
+        raise InvalidInput(f"state of {name}: expected a positive sigma and a population of 4 to {MOST_AGENTS}")
+    check_generation(int(population), np.size(state["mean"]))
 
 
 # --- randomness ---------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 from turgor.body import Body
 from turgor.control import pack
 from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, room_for
-from turgor.physics.memory import LINE, Width, aligned, fields
+from turgor.physics.memory import BYTES, LINE, Width, aligned, check_memory, fields
 from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
 from turgor.physics.step import run_blocks
 from turgor.physics.tables import ground_tables, make_kernel, write_ground
@@ -85,9 +85,11 @@ class Batch:
             self.kernel.field(brain, Brain, "bias")[:] = biases[agents].T
 
     def trace(self, steps: int) -> np.ndarray:
-        """Room for a recording of the first block, float32 [step + 1, row, lane]."""
+        """Room for a recording of the first block, float32 [step + 1, row, lane]. Raises `InvalidInput` for more steps
+        than can be recorded."""
         body = self.kernel.lengths
         row = 5 * body["mass"] + body["spring"] + body["chamber"] + body["input"]
+        check_memory("steps: expected fewer to be recorded", BYTES * WIDTH * row * (steps + 1))
         return aligned(steps + 1, row * WIDTH).reshape(steps + 1, row, WIDTH)
 
     def run(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from turgor.body import Body
+from turgor.physics.memory import check_memory
 from turgor.physics.model import MARGIN, NOWHERE
 from turgor.scene import Scene
 
@@ -65,10 +66,20 @@ def cut_into_columns(scene: Scene, reach: float) -> Columns:
     high = np.maximum(segments[:, 0], segments[:, 2]) + reach
     cuts = np.unique(np.float32(np.concatenate([low, high])))
     left, right = np.concatenate([[-np.inf], cuts]), np.concatenate([cuts, [np.inf]])
-    column, segment = np.nonzero((low < right[:, None]) & (high > left[:, None]))  # by column, then by segment
-    listed = np.bincount(column, minlength=len(left))
+    # a segment is in reach of the columns from the first that ends behind its `low` to the last that begins before its
+    # `high`; listed by column, then by segment
+    first, last = np.searchsorted(right, low, side="right"), np.searchsorted(left, high, side="left")
+    count = last - first
+    listed = np.cumsum(np.bincount(first, minlength=len(left) + 1) - np.bincount(last, minlength=len(left) + 1))[:-1]
+    slots = max(1, listed.max())
+    expected = "segments: expected fewer that lie above each other"
+    check_memory(expected, 8 * len(left) * int(slots))
+    segment = np.repeat(np.arange(len(segments)), count)
+    column = np.arange(len(segment)) + np.repeat(first - np.cumsum(count) + count, count)
+    order = np.argsort(column, kind="stable")
+    column, segment = column[order], segment[order]
     slot = np.arange(len(column)) - np.repeat(np.cumsum(listed) - listed, listed)
-    candidate = np.full((len(left), max(1, listed.max())), NOWHERE)
+    candidate = np.full((len(left), slots), NOWHERE)
     candidate[column, slot] = segment
 
     bottom, top = _span(segments[segment], left[column] - reach, right[column] + reach)

@@ -21,8 +21,10 @@ from numba.core import cgutils
 from numba.core.extending import NativeValue, lower_builtin, models, register_model, typeof_impl, unbox
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
+from turgor.errors import InvalidInput
 from turgor.physics.lanes import ELEMENT, SCALAR, Lanes, as_lanes, intrinsic
 
+MOST_BYTES = 256_000_000  # of one piece of memory; what would take more is refused
 LINE = 64  # [byte], a cache line and the widest vector
 BYTES = 4  # of a float32 and an int32
 
@@ -187,6 +189,12 @@ FIELD: dict[Any, tuple[str, bool]] = {
     FloatTable: ("float", False),
     IntTable: ("int", False),
 }
+
+
+def check_memory(expected: str, size: int) -> None:
+    """Raises `InvalidInput` where `size` bytes are more than a single piece of memory may have."""
+    if size > MOST_BYTES:
+        raise InvalidInput(f"{expected}, in at most {MOST_BYTES / 1e6:.0f} MB", f"{size / 1e6:.0f} MB")
 
 
 @cache

@@ -23,7 +23,7 @@ from turgor.control import (
 from turgor.errors import InvalidInput
 from turgor.physics import model
 from turgor.physics.ground import Columns, Room
-from turgor.physics.memory import aligned, field_of, fields, layout
+from turgor.physics.memory import BYTES, aligned, check_memory, field_of, fields, layout
 from turgor.physics.model import (
     CONTROLLED,
     DISTRIBUTED,
@@ -36,8 +36,10 @@ from turgor.physics.model import (
     SINUSOID,
     VIEWS,
     WIDTH,
+    Brain,
     Ground,
     Model,
+    Result,
     Settings,
     State,
     Work,
@@ -70,6 +72,11 @@ class Kernel(NamedTuple):
         """Room for what `hand_out` writes: observations [agent, input] and stands [agent, stand], not filled."""
         width = 5 * self.lengths["mass"] + 2 * self.lengths["chamber"] + 1
         return np.empty((agents, self.lengths["input"]), np.float32), np.empty((agents, width), np.float32)
+
+    @property
+    def block_bytes(self) -> int:
+        """Memory of a block of agents [byte]."""
+        return BYTES * sum(self.size(view) for view in (State, Brain, Result))
 
     @property
     def stand(self) -> dict[str, tuple[slice, tuple[int, ...]]]:
@@ -120,6 +127,9 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
     }
     lengths |= _controller_lengths(task)
     layouts = _layouts(lengths)
+    for k, view in enumerate(VIEWS):
+        expected = "task: expected fewer masses, springs, segments, hidden units, messages or a shorter window"
+        check_memory(f"{expected} ({WIDTH} agents' {view.__name__.lower()})", BYTES * int(layouts[k].max()))
     buffer = aligned(1, layouts[0, len(fields(Model))])[0]
     settings = Settings(
         lanes=np.int32(WIDTH),

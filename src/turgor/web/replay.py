@@ -44,6 +44,7 @@ FORMAT = 1
 MILLIMETRE = 1e-3  # [m], what a position is rounded to
 FACTS = ("title", "unit", "fitness", "robust", "solved", "name", "body", "condition", "controller", "seed")
 WHICH = ("best", "solver")
+REPLAY_BYTES = 200_000_000  # of its arrays, at most
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):
@@ -235,7 +236,13 @@ def read_replay(data: bytes) -> Replay:
     """The `Replay` in `data`; raises `InvalidInput` for anything else."""
     try:
         header, end = _header(data)
-        stream, first, arrays = zlib.decompress(data[end:]), 0, {}
+        declared = [
+            (math.prod(entry["shape"]), np.dtype(msgspec.convert(entry["type"], Kind))) for entry in header.arrays
+        ]
+        size = sum(count * kind.itemsize for count, kind in declared)
+        if not 0 <= size <= REPLAY_BYTES:
+            raise ValueError(f"arrays of {size} bytes")
+        stream, first, arrays = zlib.decompressobj().decompress(data[end:], size + 1), 0, {}
         for entry in header.arrays:
             kind, shape = np.dtype(msgspec.convert(entry["type"], Kind)).newbyteorder("<"), entry["shape"]
             count = math.prod(shape)

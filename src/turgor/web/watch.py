@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from turgor.body import SIZES
-from turgor.errors import InvalidInput, describe
+from turgor.errors import LARGEST_INTEGER, InvalidInput, describe
 from turgor.files import read_arrays
 from turgor.runs import COLUMNS, FORMATS, Row, Settings, Status
 from turgor.web.guard import check_file
@@ -22,7 +22,6 @@ from turgor.web.guard import check_file
 RECORD_BYTES, HISTORY_BYTES, CHAMPION_BYTES, CHECKPOINT_BYTES = 5_000_000, 50_000_000, 50_000_000, 500_000_000
 TAIL_BYTES, NEWS_BYTES = 4_096, 200_000  # of a history: read for its last row, and of its new rows at most
 QUIET = 180.0  # [s] without a new generation after which a run that does not say it ended is taken for interrupted
-LARGEST_INTEGER = 2**53  # that a page can hold
 
 
 class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -245,6 +244,9 @@ def _read_champion(path: Path) -> tuple[float | None, bool | None]:
     if not path.exists():
         return None, None
     arrays = read_arrays(path, checksum=False)
+    for name in ("fitness", "solved"):
+        if name in arrays and (arrays[name].shape or arrays[name].dtype.kind not in "biuf"):
+            raise InvalidInput(f"{path.name}: expected one number in {name}", describe(arrays[name]))
     found = {name: arrays[name].item() for name in ("fitness", "solved") if name in arrays}
     fitness, solved = found.get("fitness"), found.get("solved")
     return None if fitness is None else float(fitness), None if solved is None else bool(solved)
