@@ -28,8 +28,8 @@ SLOWEST = 5.0  # [s]
 MEMORY = 1_000_000_000  # [byte]
 # of 100 inputs, what each target gets
 SHARES = {
-    "run.json": 14, "history.csv": 8, "champion.npz": 10, "checkpoint.npz": 8, "command": 8, "message": 24,
-    "visit": 0.3, "request": 1.7, "task": 14, "replay": 4, "theta": 8,
+    "run.json": 14, "history.csv": 5, "champion.npz": 9, "checkpoint.npz": 5, "command": 5, "message": 35, "visit": 0.3,
+    "request": 1.7, "task": 17, "replay": 4, "theta": 4,
 }  # fmt: skip
 
 

@@ -14,13 +14,13 @@ SMALLEST, LARGEST = 1e-9, 1e9  # what a positive number of a body or a scene may
 
 
 def as_numbers(name: str, value: ArrayLike, dtype: Any = np.float64) -> np.ndarray:
-    """`value` as an array of `dtype`, whatever its shape; what is too large for it is infinite. Raises `InvalidInput`
-    for text, objects and rows of unequal length."""
+    """`value` as an array of `dtype` (None: its own), whatever its shape; what is too large for it is infinite. Raises
+    `InvalidInput` for text, objects and rows of unequal length."""
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "biufO":  # text that looks like a number is none
             raise TypeError
         with np.errstate(over="ignore"):
-            return array.astype(dtype, copy=False)
+            return array if dtype is None else array.astype(dtype, copy=False)
     except (TypeError, ValueError, OverflowError):
         raise InvalidInput(f"{name}: expected numbers", describe(value)) from None

@@ -10,8 +10,13 @@ class InvalidInput(ValueError):
     """Something from outside is not what was expected."""
 
     def __init__(self, expected: str, got: str | None = None) -> None:
-        line = " ".join((expected if got is None else f"{expected}; got {got}").splitlines())
-        super().__init__(line if len(line) <= LONGEST else line[: LONGEST - 3] + "...")
+        super().__init__(one_line(expected if got is None else f"{expected}; got {got}"))
+
+
+def one_line(text: str) -> str:
+    """`text` in one line that is not endless."""
+    line = " ".join(text.splitlines())
+    return line if len(line) <= LONGEST else line[: LONGEST - 3] + "..."
 
 
 def describe(value: object) -> str:

@@ -94,7 +94,8 @@ class Champion(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     @property
     def robust_fitness(self) -> float | None:
         """Median fitness from slightly moved starts."""
-        return None if self.robust is None else float(np.median(self.robust))
+        with np.errstate(over="ignore"):
+            return None if self.robust is None else float(np.median(np.asarray(self.robust, dtype=np.float64)))
 
 
 class Checkpoint(msgspec.Struct, frozen=True, eq=False, kw_only=True):
@@ -338,7 +339,10 @@ class Run:
     def _parse_checkpoint(self, path: Path) -> Checkpoint:
         arrays = read_arrays(path, checksum=self._checksums)
         if "history" in arrays:
-            rows = _checked_rows(arrays["history"].tolist(), path)
+            history = arrays["history"]
+            if history.ndim != 2 or history.dtype != np.float64:
+                raise InvalidInput(f"{path}: expected a table of float64 in history", str(history.dtype))
+            rows = _checked_rows(history.tolist(), path)
         else:  # of format 1
             generation = arrays.get("generation", np.array(-1))
             if generation.shape or not 0 <= generation <= self.generation:
@@ -512,18 +516,15 @@ def _champion(arrays: dict[str, np.ndarray], prefix: str, task: Task, path: Path
         raise InvalidInput(f"{path}: expected {prefix}theta as float64 {list(shape)}", found)
     for name in ("fitness", "steps", "solved", "generation"):
         value = fields.get(name, np.zeros(0))
-        if value.shape:
+        if value.shape or value.dtype.kind not in "biuf":
             raise InvalidInput(f"{path}: expected one number in {prefix}{name}", f"shape {list(value.shape)}")
-        if value.dtype.kind not in "biuf":
-            raise InvalidInput(f"{path}: expected a number in {prefix}{name}", str(value.dtype))
-        if name != "fitness" and not 0 <= value <= LARGEST_INTEGER:
-            raise InvalidInput(f"{path}: expected 0 or more in {prefix}{name}", describe(value))
-        fields[name] = {"fitness": float, "solved": bool}.get(name, int)(value)
+        number = value.item()
+        if name != "fitness" and not 0 <= number <= LARGEST_INTEGER:
+            raise InvalidInput(f"{path}: expected 0 or more in {prefix}{name}", describe(number))
+        fields[name] = {"fitness": float, "solved": bool}.get(name, int)(number)
     for name in ("robust", "robust_solved"):
-        value = fields.get(name)
-        if value is not None and (
-            value.ndim != 1 or not 0 < len(value) <= MOST_REPEATS or value.dtype.kind not in "biuf"
-        ):
+        value = fields.get(name, np.zeros(1))
+        if value.ndim != 1 or not 0 < len(value) <= MOST_REPEATS or value.dtype.kind not in "biuf":
             found = f"{value.dtype} {list(value.shape)}"
             raise InvalidInput(f"{path}: expected numbers of shape [repeat] in {prefix}{name}", found)
     if not (np.isfinite(theta).all() and np.isfinite(fields["fitness"])):

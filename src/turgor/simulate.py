@@ -186,7 +186,7 @@ class Simulator:
         stood. `position` [m], shape [restarted, mass, 2], and `scenes` [restarted] are for the former alone; `scenes`
         are for agents that had their own from `reset` on."""
         out = self._room_for_step("restart", out)
-        which = np.asarray(which)
+        which = as_numbers("which", which, None)
         if which.shape != (len(out.stand),) or which.dtype != bool:
             raise InvalidInput(f"which: expected bools of shape [{len(out.stand)}]", describe(which))
         fresh = np.flatnonzero(which)

@@ -13,7 +13,7 @@ from turgor.cli.export import EXPORT
 from turgor.cli.reproduce import REPRODUCE
 from turgor.cli.view import VIEW
 from turgor.cli.words import say
-from turgor.errors import InvalidInput
+from turgor.errors import InvalidInput, one_line
 
 INTERRUPTED = 130  # exit status, as shells have it for Ctrl-C
 
@@ -72,7 +72,7 @@ def _run(argv: list[str]) -> int:
 
 
 def _fail(message: str) -> int:
-    print(f"turgor: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"turgor: error: {' '.join(one_line(message).split())}", file=sys.stderr)
     return 2
 
 

@@ -40,6 +40,9 @@ class Parser(argparse.ArgumentParser):
         """The options in `argv`; raises `InvalidInput`."""
         if any("\0" in argument for argument in argv):
             raise InvalidInput(f"{self.prog}: expected text and names of files", "a NUL character")
+        for argument in argv:
+            if argument.startswith("--") and argument.endswith("=--"):  # argparse would hand out an empty list
+                raise InvalidInput(f"{argument[:-3]}: expected a value", "--")
         options, unknown = self.parse_known_args(argv)
         if unknown:
             name = unknown[0].partition("=")[0]

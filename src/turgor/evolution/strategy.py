@@ -149,10 +149,13 @@ def check_state(name: str, state: Mapping[str, np.ndarray], shapes: Mapping[str,
         for letter, length in zip(letters, value.shape, strict=False):
             lengths.setdefault(letter, length)
         shape = tuple(lengths.get(letter, 0) for letter in letters)
-        kinds = "u" if key == "generator" else "iuf"
-        if value.shape != shape or value.dtype.kind not in kinds or not np.isfinite(value).all():
+        kind = np.uint64 if key == "generator" else np.float64 if letters else value.dtype
+        if value.shape != shape or value.dtype != kind or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
             raise InvalidInput(f"state of {name}: expected finite numbers of shape {list(shape)} in {key}")
-    population = state["population"].item()
+    *_, left, half = state["generator"].tolist()
+    if left > 1 or half >= 2**32:
+        raise InvalidInput(f"state of {name}: expected the bits of a PCG64 generator in generator")
+    population = np.asarray(state["population"]).item()
     if not (state["sigma"] > 0 and 4 <= population <= MOST_AGENTS and int(population) == population):
         raise InvalidInput(f"state of {name}: expected a positive sigma and a population of 4 to {MOST_AGENTS}")
     check_generation(int(population), np.size(state["mean"]))
