@@ -44,6 +44,8 @@ def writing(path: Path) -> Generator[None]:
 
 def write_whole(path: Path, data: bytes) -> None:
     """Writes a file that is either the old one or the new one, whatever happens meanwhile. Raises `NotWritten`."""
+    if not path.name:
+        raise NotWritten("expected the name of a file", repr(str(path)))
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with writing(path):
         try:

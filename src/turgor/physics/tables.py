@@ -47,6 +47,7 @@ from turgor.physics.model import (
 from turgor.task import Leave, Task
 
 LARGEST = float(np.finfo(np.float32).max)
+LEAST_PRESSURE = 1e-30  # [Pa]
 KINDS: dict[type, int] = {Linear: LINEAR, MLP: model.MLP, Sinusoid: SINUSOID, Distributed: DISTRIBUTED}
 
 
@@ -293,8 +294,8 @@ def _chamber_tables(task: Task) -> dict[str, np.ndarray]:
     body, low_high = task.body, task.pressure_range
     between = {frozenset(pair): k for k, pair in enumerate(body.springs.tolist())}
     edges = [edge for loop in body.chambers for edge in zip(loop, loop[1:] + loop[:1], strict=True)]
-    # a chamber without gas has no p_max to be seen relative to
-    scale = np.divide(1, low_high[:, 1], out=np.zeros(len(low_high)), where=low_high[:, 1] > 0)
+    # a chamber without gas, or nearly so, has no p_max to be seen relative to
+    scale = np.divide(1, low_high[:, 1], out=np.zeros(len(low_high)), where=low_high[:, 1] > LEAST_PRESSURE)
     return {
         "edge_start": np.cumsum([0, *(len(loop) for loop in body.chambers)]),
         "edge_from": np.array([a for a, _ in edges]),

@@ -242,7 +242,10 @@ def read_replay(data: bytes) -> Replay:
         size = sum(count * kind.itemsize for count, kind in declared)
         if not 0 <= size <= REPLAY_BYTES:
             raise ValueError(f"arrays of {size} bytes")
-        stream, first, arrays = zlib.decompressobj().decompress(data[end:], size + 1), 0, {}
+        unpack, first, arrays = zlib.decompressobj(), 0, {}
+        stream = unpack.decompress(data[end:], size + 1)
+        if len(stream) != size or not unpack.eof:
+            raise ValueError(f"a stream that is not of {size} bytes")
         for entry in header.arrays:
             kind, shape = np.dtype(msgspec.convert(entry["type"], Kind)).newbyteorder("<"), entry["shape"]
             count = math.prod(shape)
