@@ -212,7 +212,10 @@ BROKEN = {
         "a run of format 1 or 2; got format 9",
     ),
     "seed": (lambda run: _replaced(run / "run.json", '"seed":0', '"seed":1' + "0" * 30), "run.json: "),
-    "seed 2": (lambda run: _replaced(run / "run.json", '"seed":0', '"seed":9007199254740993'), "up to 2^53"),
+    "seed 2": (
+        lambda run: _replaced(run / "run.json", '"seed":0', '"seed":9007199254740993'),
+        "seed: expected a whole number, 0 to 9007199254740992",
+    ),
     "large record": (lambda run: _hole(run / "run.json", 6_000_000), "run.json: expected at most 5 MB; got 6.0 MB"),
     "large history": (lambda run: _hole(run / "history.csv", 10**10), "history.csv: expected at most 50 MB"),
     "columns": (lambda run: (run / "history.csv").write_text("a,b\n1,2\n"), "history.csv: expected the columns"),

@@ -221,8 +221,6 @@ def _read_record(path: Path) -> Record:
     if record.format not in FORMATS:
         formats = " or ".join(str(known) for known in FORMATS)
         raise InvalidInput(f"run.json: expected a run of format {formats}", f"format {describe(record.format)}")
-    if max(abs(record.settings.seed), abs(record.settings.evaluations)) > LARGEST_INTEGER:
-        raise InvalidInput("run.json: expected a seed and evaluations up to 2^53")
     return record
 
 
