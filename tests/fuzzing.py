@@ -18,6 +18,7 @@ import os
 import shutil
 import struct
 import tempfile
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -454,11 +455,7 @@ def other_archive(random: Random, members: dict[str, bytes]) -> bytes:
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", method) as archive:
         for key, value in entries:
-            import warnings
-
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                archive.writestr(key, value)
+            archive.writestr(key, value)
     raw = bytearray(data.getvalue())
     if what >= 5:  # the fields of one of the archive's own records
         marks = (b"PK\x01\x02", b"PK\x03\x04", b"PK\x05\x06")
@@ -931,4 +928,6 @@ TARGETS = {
 
 def input_of(target: Target, seed: int, k: int) -> bytes:
     """Input `k` of a target: the same for the same `seed`, whatever was tried before."""
-    return target.make(Random(f"{seed} {target.name} {k}"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of NumPy and zipfile, at what they are made to write
+        return target.make(Random(f"{seed} {target.name} {k}"))
