@@ -34,6 +34,7 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     scheduler_byte: float = 0.0
     worker_task: float = 0.0
     worker_byte: float = 0.0
+    latency: float = 0.0  # [s] a shard, in which nobody works: messages wait to be sent together
     network: float = float("inf")  # [byte/s], each way
     one_machine: int | None = None  # its cores, if all run there and all workers in one process; None: own ones
 
@@ -144,7 +145,10 @@ class _Run:
             self._have(self.coordinator, cost, partial(self.submit, evolution, shards - 1), first=True)
 
     def send(self, evolution: int) -> None:
-        self._have(self.there, self.load.bytes_there / self.cluster.network, partial(self.arrive, evolution))
+        self._have(self.there, self.load.bytes_there / self.cluster.network, partial(self.wait, self.arrive, evolution))
+
+    def wait(self, event: Callable[[int], None], evolution: int) -> None:
+        self._after(self.cluster.latency / 2, partial(event, evolution))
 
     def arrive(self, evolution: int) -> None:
         self.arrived.append(evolution)
@@ -167,7 +171,7 @@ class _Run:
     def end(self, since: float, evolution: int) -> None:
         self.free += 1
         self.simulated += self.now - since
-        self._have(self.back, self.load.bytes_back / self.cluster.network, partial(self.finish, evolution))
+        self._have(self.back, self.load.bytes_back / self.cluster.network, partial(self.wait, self.finish, evolution))
         self.start()
 
     def finish(self, evolution: int) -> None:

@@ -16,13 +16,13 @@ from cluster_model import Cluster, Load, simulate  # noqa: E402
 
 
 def test_one_worker_does_one_thing_after_the_other() -> None:
-    """2 generations of 1 shard: ask 5, submit 1, schedule 2, send 10 / 5, worker 3 + 100, back 5 / 5, 2, 1."""
-    cluster = Cluster(workers=1, coordinator_task=2, scheduler_task=4, worker_task=3, network=5)
+    """2 generations of 1 shard: ask 5, submit 1, schedule 2, send 10 / 5, worker 3 + 100, back 5 / 5, 2, 1; wait 8."""
+    cluster = Cluster(workers=1, coordinator_task=2, scheduler_task=4, worker_task=3, network=5, latency=8)
     load = Load(evolutions=1, generations=2, shards=1, seconds=100, bytes_there=10, bytes_back=5, optimizer=5)
     out = simulate(cluster, load)
-    assert out.seconds == 2 * (5 + 1 + 2 + 2 + 103 + 1 + 2 + 1)
-    assert out.workers == pytest.approx(206 / 234)
-    assert (out.coordinator, out.scheduler, out.network) == pytest.approx((14 / 234, 8 / 234, 4 / 234))
+    assert out.seconds == 2 * (5 + 1 + 2 + 2 + 103 + 1 + 2 + 1 + 8)
+    assert out.workers == pytest.approx(206 / 250)
+    assert (out.coordinator, out.scheduler, out.network) == pytest.approx((14 / 250, 8 / 250, 4 / 250))
     assert out.bottleneck == "workers"
 
 

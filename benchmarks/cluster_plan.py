@@ -1,0 +1,185 @@
+"""The plan: cores, schedulers and bytes for a number of evaluations a day, from measured figures and the model.
+
+Measured are the engine, the optimizers, the bytes of what travels, and the CPU time of a shard at scheduler, coordinator
+and worker. Assumed are the network and the room that is left free; modelled is what comes of them together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from cluster_model import Cluster, Load, simulate
+from scale_page import DAY, Row, find, read_rows
+
+STEPS = 1800  # of an evaluation
+NETWORK = 1.25e9  # [byte/s], 10 Gbit/s each way
+WORKERS_BUSY = 0.9  # what a worker is planned for
+SERVERS_BUSY = 0.8  # and scheduler, coordinator and network
+PIECE = 20.0  # [s] of a whole run, before its state comes back
+POPULATION, SMALL_POPULATION = 1000, 21
+TARGETS = {1e9: ("small", "medium", "large"), 1e10: ("small",), 1e11: ("small",)}
+CORES = (1, 4, 16, 64, 256, 1024, 4096)
+
+
+class Way(msgspec.Struct, frozen=True, kw_only=True):
+    """How evolutions are spread over a cluster: what a task is."""
+
+    name: str
+    evaluations: float  # of a task
+    seconds: float  # [s] on a worker
+    shards: int  # tasks of a generation
+    bytes_there: float
+    bytes_back: float
+    optimizer: float = 0.0  # [s] of the coordinator, a generation
+
+
+def ways(body: str, results: Path) -> list[Way]:
+    """The ways to spread evolutions of `body`, fed by what was measured."""
+    engine, travel = read_rows(results / "scale-engine.csv"), read_rows(results / "scale-travel.csv")
+    rates = {row["agents"]: row["rate"] / STEPS for row in engine if row["body"] == body}  # evaluations/s of a core
+    parameters = find(engine, body=body)["parameters"]
+
+    def generation(strategy: str, population: int) -> float:
+        rows = read_rows(results / "scale-optimizer.csv")
+        return find(rows, strategy=strategy, parameters=parameters, population=population)["seconds"]
+
+    state = find(travel, body=body, what="a run's state, cma-es")["bytes"]
+    cma, openai = generation("cma-es", POPULATION), generation("openai-es", POPULATION)
+    run = SMALL_POPULATION / rates[SMALL_POPULATION] + generation("cma-es", SMALL_POPULATION)  # [s] of a generation
+    quarter = POPULATION / 4
+    return [
+        Way(
+            name="quarters of generations, float64",
+            evaluations=quarter,
+            seconds=quarter / rates[256],
+            shards=4,
+            bytes_there=8 * quarter * parameters,
+            bytes_back=8 * quarter,
+            optimizer=cma,
+        ),
+        Way(
+            name="whole generations, float32",
+            evaluations=POPULATION,
+            seconds=POPULATION / rates[POPULATION],
+            shards=1,
+            bytes_there=4 * POPULATION * parameters,
+            bytes_back=8 * POPULATION,
+            optimizer=cma,
+        ),
+        Way(
+            name="whole generations, seeds",
+            evaluations=POPULATION,
+            seconds=POPULATION / rates[POPULATION] + openai,  # the worker draws theta: at most what ask and tell take
+            shards=1,
+            bytes_there=4 * parameters + 8 * POPULATION,
+            bytes_back=8 * POPULATION,
+            optimizer=openai,
+        ),
+        Way(
+            name="whole runs",
+            evaluations=SMALL_POPULATION * PIECE / run,
+            seconds=PIECE,
+            shards=1,
+            bytes_there=state,
+            bytes_back=state,
+        ),
+    ]
+
+
+def costs(rows: list[Row]) -> dict[str, float]:
+    """What a shard and a byte cost each process, fitted to the CPU times of all rows of the real scheduler; and the
+    latency, from the one in which empty shards went one by one."""
+    found, empty = {}, find(rows, seconds=0.0)
+    rows = [row for row in rows if row is not empty]
+    size = np.array([row["bytes_there"] + row["bytes_back"] for row in rows])
+    for who in ("coordinator", "scheduler", "worker"):
+        seconds = np.array([row[who] for row in rows])
+        # relative errors count, so that small shards do as well
+        terms = np.stack([np.ones_like(size), size], axis=1) / seconds[:, None]
+        (task, byte), *_ = np.linalg.lstsq(terms, np.ones_like(seconds), rcond=None)
+        found |= {f"{who}_task": float(task), f"{who}_byte": max(float(byte), 0.0)}
+    working = sum(found[f"{who}_task"] for who in ("coordinator", "scheduler", "worker"))
+    return {**found, "latency": max(empty["wall"] / empty["tasks"] - working, 0.0)}
+
+
+def predict(rows: list[Row]) -> list[float]:
+    """Wall time [s] that the model expects of each row of the real scheduler, from CPU times alone."""
+    found = []
+    for row in rows:
+        numbers = {name: row[name] for name in Load.__struct_fields__}
+        for name in ("evolutions", "generations", "shards"):
+            numbers[name] = int(numbers[name])
+        cluster = Cluster(workers=int(row["workers"]), **costs(rows), one_machine=int(row["cores"]))
+        found.append(simulate(cluster, Load(**numbers)).seconds)
+    return found
+
+
+def evaluations(way: Way, workers: int, cost: dict[str, float]) -> float:
+    """Evaluations/s of one coordinator and scheduler with `workers` workers, as modelled: two tasks in flight each."""
+    evolutions = math.ceil(2 * workers / way.shards)
+    load = Load(
+        evolutions=evolutions,
+        generations=max(4, math.ceil(2000 / (evolutions * way.shards))),
+        shards=way.shards,
+        seconds=way.seconds,
+        bytes_there=way.bytes_there,
+        bytes_back=way.bytes_back,
+        optimizer=way.optimizer,
+    )
+    return load.tasks * way.evaluations / simulate(Cluster(workers=workers, network=NETWORK, **cost), load).seconds
+
+
+def plan(size: Any, out: Path) -> Iterator[Row]:
+    """Cores and schedulers for each target, body and way; and whether the model reaches the target with them."""
+    cost = costs(read_rows(out / "scale-scheduler.csv"))
+    for target, bodies in TARGETS.items():
+        for body in bodies:
+            for way in ways(body, out):
+                yield {"body": body, "target": target, "way": way.name, **needs(way, target / DAY, cost)}
+
+
+def needs(way: Way, rate: float, cost: dict[str, float]) -> Row:
+    """What `rate` evaluations/s take: arithmetic; and the model's answer to it."""
+    tasks = rate / way.evaluations  # a second
+    both = way.bytes_there + way.bytes_back
+    spent = {who: cost[f"{who}_task"] + both * cost[f"{who}_byte"] for who in ("coordinator", "scheduler", "worker")}
+    busy = {
+        "scheduler": tasks * spent["scheduler"],
+        "optimizer": tasks / way.shards * way.optimizer,
+        "coordinator": tasks * spent["coordinator"],
+        "network": tasks * max(way.bytes_there, way.bytes_back) / NETWORK,
+    }
+    # optimizer and coordinator are one process
+    schedulers = max(busy["scheduler"], busy["optimizer"] + busy["coordinator"], busy["network"]) / SERVERS_BUSY
+    schedulers = math.ceil(schedulers)
+    cores = math.ceil(tasks * (way.seconds + spent["worker"]) / WORKERS_BUSY)
+    limit = max(busy, key=lambda who: busy[who])
+    return {
+        "cores_needed": cores,
+        "tasks_a_second": tasks,
+        "bytes_a_second": tasks * way.bytes_there,
+        "schedulers": schedulers,
+        "limit": limit,
+        "share": busy[limit] / schedulers,
+        "reached": evaluations(way, math.ceil(cores / schedulers), cost) * schedulers / rate,
+    }
+
+
+def curves(size: Any, out: Path) -> Iterator[Row]:
+    """Evaluations/s of one coordinator and scheduler against cores, small bodies, as modelled."""
+    cost = costs(read_rows(out / "scale-scheduler.csv"))
+    engine = read_rows(out / "scale-engine.csv")
+    best = max(row["rate"] for row in engine if row["body"] == "small") / STEPS
+    for way in ways("small", out):
+        for cores in CORES:
+            yield {
+                "way": way.name,
+                "cores": cores,
+                "evaluations": evaluations(way, cores, cost),
+                "ideal": cores * best,
+            }
