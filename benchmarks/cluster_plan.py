@@ -1,7 +1,7 @@
 """The plan: cores, schedulers and bytes for a number of evaluations a day, from measured figures and the model.
 
-Measured are the engine, the optimizers, the bytes of what travels, and the CPU time of a shard at scheduler, coordinator
-and worker. Assumed are the network and the room that is left free; modelled is what comes of them together.
+Measured are the engine, the optimizers, the bytes of what travels, and the CPU time of a shard at scheduler,
+coordinator and worker. Assumed are the network and the room left free; modelled is what comes of them together.
 """
 
 from __future__ import annotations
@@ -48,36 +48,37 @@ def ways(body: str, results: Path) -> list[Way]:
         rows = read_rows(results / "scale-optimizer.csv")
         return find(rows, strategy=strategy, parameters=parameters, population=population)["seconds"]
 
+    back = find(travel, body=body, what="their final positions, steps, solved")["bytes"] / 256  # of an agent
     state = find(travel, body=body, what="a run's state, cma-es")["bytes"]
     cma, openai = generation("cma-es", POPULATION), generation("openai-es", POPULATION)
     run = SMALL_POPULATION / rates[SMALL_POPULATION] + generation("cma-es", SMALL_POPULATION)  # [s] of a generation
     quarter = POPULATION / 4
     return [
         Way(
-            name="quarters of generations, float64",
+            name="shards of 250",
             evaluations=quarter,
             seconds=quarter / rates[256],
             shards=4,
-            bytes_there=8 * quarter * parameters,
-            bytes_back=8 * quarter,
+            bytes_there=4 * quarter * parameters,
+            bytes_back=back * quarter,
             optimizer=cma,
         ),
         Way(
-            name="whole generations, float32",
+            name="generations of 1000",
             evaluations=POPULATION,
             seconds=POPULATION / rates[POPULATION],
             shards=1,
             bytes_there=4 * POPULATION * parameters,
-            bytes_back=8 * POPULATION,
+            bytes_back=back * POPULATION,
             optimizer=cma,
         ),
         Way(
-            name="whole generations, seeds",
+            name="generations of 1000, as seeds",
             evaluations=POPULATION,
             seconds=POPULATION / rates[POPULATION] + openai,  # the worker draws theta: at most what ask and tell take
             shards=1,
             bytes_there=4 * parameters + 8 * POPULATION,
-            bytes_back=8 * POPULATION,
+            bytes_back=back * POPULATION,
             optimizer=openai,
         ),
         Way(
@@ -138,7 +139,7 @@ def plan(size: Any, out: Path) -> Iterator[Row]:
     """Cores and schedulers for each target, body and way; and whether the model reaches the target with them."""
     cost = costs(read_rows(out / "scale-scheduler.csv"))
     for target, bodies in TARGETS.items():
-        for body in bodies:
+        for body in [body for body in bodies if body in size.bodies]:
             for way in ways(body, out):
                 yield {"body": body, "target": target, "way": way.name, **needs(way, target / DAY, cost)}
 
@@ -156,7 +157,7 @@ def needs(way: Way, rate: float, cost: dict[str, float]) -> Row:
     }
     # optimizer and coordinator are one process
     schedulers = max(busy["scheduler"], busy["optimizer"] + busy["coordinator"], busy["network"]) / SERVERS_BUSY
-    schedulers = math.ceil(schedulers)
+    schedulers = max(math.ceil(schedulers), 1)
     cores = math.ceil(tasks * (way.seconds + spent["worker"]) / WORKERS_BUSY)
     limit = max(busy, key=lambda who: busy[who])
     return {

@@ -28,7 +28,6 @@ from turgor.bench.parts import Skipped
 from turgor.simulate import available_cores
 
 HERE = str(Path(__file__).parent)  # where the scheduler finds `shard`
-FITNESS = 8  # [byte] an agent, of what comes back
 
 
 def scheduler(size: Any, out: Path) -> Iterator[dict[str, Any]]:
@@ -37,7 +36,8 @@ def scheduler(size: Any, out: Path) -> Iterator[dict[str, Any]]:
         import distributed  # noqa: F401
     except ImportError:
         raise Skipped("it needs the extra cluster (distributed)") from None
-    for workers, loads in make_loads(size, read_rows(out / "scale-engine.csv")).items():
+    engine, travel = read_rows(out / "scale-engine.csv"), read_rows(out / "scale-travel.csv")
+    for workers, loads in make_loads(size, engine, travel).items():
         for load, counted in asyncio.run(run_loads(workers, loads)):
             yield {
                 "workers": workers,
@@ -48,12 +48,13 @@ def scheduler(size: Any, out: Path) -> Iterator[dict[str, Any]]:
             }
 
 
-def make_loads(size: Any, engine: list[dict[str, Any]]) -> dict[int, list[Load]]:
-    """The loads that each number of workers gets."""
+def make_loads(size: Any, engine: list[dict[str, Any]], travel: list[dict[str, Any]]) -> dict[int, list[Load]]:
+    """The loads that each number of workers gets: shards of small bodies."""
+    back = find(travel, body=size.bodies[0], what="their final positions, steps, solved")["bytes"] / 256
     one = find(engine, body=size.bodies[0], agents=256)
     agent, parameters = size.steps / one["rate"], int(one["parameters"])
 
-    def load(evolutions: int, shards: int, agents: int = 256, number: int = 8, optimizer: float = 0.0) -> Load:
+    def load(evolutions: int, shards: int, agents: int = 256, number: int = 4, optimizer: float = 0.0) -> Load:
         """`number`: bytes of a parameter, 0 for seeds."""
         seconds = agents * agent
         there = agents * parameters * number if number else agents * 8 + parameters * 4
@@ -65,7 +66,7 @@ def make_loads(size: Any, engine: list[dict[str, Any]]) -> dict[int, list[Load]]
             shards=shards,
             seconds=seconds,
             bytes_there=there,
-            bytes_back=agents * FITNESS,
+            bytes_back=agents * back,
             optimizer=optimizer,
         )
 
@@ -77,9 +78,9 @@ def make_loads(size: Any, engine: list[dict[str, Any]]) -> dict[int, list[Load]]
             found[workers] += [
                 load(workers // 4, 4),  # in flight: one for each worker
                 load(2 * workers, 4),  # and eight
-                load(workers // 2, 4, number=4),
+                load(workers // 2, 4, number=8),
                 load(workers // 2, 4, agents=64),
-                load(workers // 2, 4, agents=1024, number=4),
+                load(workers // 2, 4, agents=1024),
                 load(2 * workers, 1),
             ]
     workers = size.cluster_workers[1]

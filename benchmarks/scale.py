@@ -4,8 +4,9 @@
     ./run python benchmarks/scale.py million optimizer     # some parts
     ./run python benchmarks/scale.py --quick --out /tmp    # a look, in a minute or two; not for a record
 
-Each part prints its table and keeps its rows in OUT/scale-PART.csv (default: benchmarks/results). The tables and figures
-of docs/scale.md are made anew from those files, unless OUT is another folder. `plan` is a model, fed by the others' rows.
+Each part prints its table and keeps its rows in OUT/scale-PART.csv (default: benchmarks/results). The tables and
+figures of docs/scale.md are made anew from those files, unless OUT is another folder. `plan` and `curves` are a model,
+fed by the others' rows.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +72,10 @@ QUICK = Size(
 
 def draw(agents: int, parameters: int, seed: int = 0) -> np.ndarray:
     """Controllers, float32 [agent, parameter], uniform in [-1, 1]."""
-    return 2 * np.random.default_rng(seed).random((agents, parameters), dtype=np.float32) - 1
+    theta = np.random.default_rng(seed).random((agents, parameters), dtype=np.float32)
+    theta *= 2  # in place: the memory of these processes is measured
+    theta -= 1
+    return theta
 
 
 def in_a_process(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -92,7 +97,7 @@ def engine(size: Size, out: Path) -> Iterator[Row]:
         for agents in size.shards:
             theta = draw(agents * cores, task.parameter_count)
             steps = int(simulator.rollout(theta).steps.sum())
-            (took,) = fastest([lambda theta=theta: simulator.rollout(theta)], size.seconds, 3)
+            (took,) = fastest([partial(simulator.rollout, theta)], size.seconds, 3)
             yield {
                 "body": body,
                 "parameters": task.parameter_count,
@@ -204,6 +209,7 @@ def travel(size: Size, out: Path) -> Iterator[Row]:
         yield packed(body, "256 agents, theta in float64", theta)
         yield packed(body, "256 agents, theta in float32", theta.astype(np.float32))
         yield packed(body, "256 agents, seeds and a mean", seeds)
+        yield packed(body, "their final positions, steps, solved", (rollout.position, rollout.steps, rollout.solved))
         yield packed(body, "their fitness", rollout.fitness)
         yield packed(body, "their whole `Rollout`", msgspec.structs.asdict(rollout))
         for name in STRATEGIES:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +128,7 @@ TABLES: dict[str, list[tuple[str, Any]]] = {
         ("worker", lambda r: milliseconds(r["worker"])),
         ("shards/s", lambda r: count(r["tasks"] / r["wall"])),
         ("of what the workers could do", lambda r: percent(r["tasks"] * r["seconds"] / r["workers"] / r["wall"])),
-        ("modelled / measured time", lambda r: f"{r['modelled'] / r['wall']:.2f}" if r["seconds"] else "gives the latency"),
+        ("modelled / measured time", lambda r: f"{r['ratio']:.2f}" if r["seconds"] else "gives the latency"),
     ],
     "plan": [
         ("body", lambda r: r["body"]),
@@ -160,7 +161,7 @@ def rows_of(name: str, results: Path) -> list[Row]:
         import cluster_plan
 
         for row, modelled in zip(rows, cluster_plan.predict(rows), strict=True):
-            row["modelled"] = modelled
+            row["ratio"] = modelled / row["wall"]
     return rows
 
 
@@ -191,10 +192,38 @@ def million_summary(results: Path) -> str:
     whole, growth = rows[-1], [row for row in rows[:-1] if row["way"].startswith("streamed")]
     least, most = min(r["peak"] for r in growth), max(r["peak"] for r in growth)
     return (
-        f"{whole['agents']:,.0f} small agents, each for {whole['steps']:,.0f} steps on hills, take {whole['seconds']:.0f} s "
-        f"on {whole['threads']:.0f} cores ({whole['rate'] / 1e6:.1f} million agent-steps/s) and {whole['peak'] / 1e6:.0f} "
-        f"MB. Streamed, the peak is {least / 1e6:.0f} to {most / 1e6:.0f} MB from {growth[0]['agents']:,.0f} agents to "
-        f"{growth[-1]['agents']:,.0f}."
+        f"{whole['agents']:,.0f} small agents, each for {whole['steps']:,.0f} steps on hills, take "
+        f"{whole['seconds']:.0f} s on {whole['threads']:.0f} cores ({whole['rate'] / 1e6:.1f} million agent-steps/s) "
+        f"and {whole['peak'] / 1e6:.0f} MB. Streamed, the peak is {least / 1e6:.0f} to {most / 1e6:.0f} MB from "
+        f"{growth[0]['agents']:,.0f} agents to {growth[-1]['agents']:,.0f}."
+    )
+
+
+def optimizer_summary(results: Path) -> str:
+    rows = rows_of("optimizer", results)
+    told = []
+    for name in dict.fromkeys(row["strategy"] for row in rows):
+        feeds = [row["feeds"] for row in rows if row["strategy"] == name]
+        told.append(f"{name} {figures(min(feeds))} to {figures(max(feeds))}")
+    return f"One coordinator keeps so many cores at work: {', '.join(told)}."
+
+
+def scheduler_summary(results: Path) -> str:
+    import cluster_plan
+
+    rows = rows_of("scheduler", results)
+    cost = cluster_plan.costs(rows)
+    ratios = [row["ratio"] for row in rows if row["seconds"]]
+    told = [
+        f"{who} {milliseconds(cost[f'{who}_task'])} ms and {milliseconds(1e6 * cost[f'{who}_byte'])} ms a MB"
+        for who in ("scheduler", "coordinator", "worker")
+    ]
+    return (
+        f"Fitted to all rows, a shard costs {', '.join(told)}; {milliseconds(cost['latency'])} ms pass in which nobody "
+        f"works. A scheduler with a core of its own and shards of few bytes is at its end at "
+        f"{1 / cost['scheduler_task']:,.0f} shards/s; this machine, whose {rows[0]['cores']:.0f} cores do all of it, "
+        f"reached {max(row['tasks'] / row['wall'] for row in rows):,.0f}. The model's time is "
+        f"{min(ratios):.2f} to {max(ratios):.2f} of the measured, {statistics.median(ratios):.2f} in the median."
     )
 
 
@@ -211,7 +240,13 @@ def plan_summary(results: Path) -> str:
     )
 
 
-SENTENCES = {"machine": machine, "million": million_summary, "plan": plan_summary}
+SENTENCES = {
+    "machine": machine,
+    "million": million_summary,
+    "optimizer": optimizer_summary,
+    "scheduler": scheduler_summary,
+    "plan": plan_summary,
+}
 
 
 # --- the page -------------------------------------------------------------------------------------------------------
@@ -227,10 +262,10 @@ def filled(text: str, results: Path) -> str:
 
 
 def between(text: str, mark: str, content: str) -> str:
-    pattern = re.compile(rf"(<!-- {mark} -->\n).*?(\n<!-- end -->)", re.DOTALL)
+    pattern = re.compile(rf"(<!-- {mark} -->\n).*?(<!-- end -->)", re.DOTALL)
     if not pattern.search(text):
         raise ValueError(f"expected a mark <!-- {mark} --> and <!-- end --> in the page")
-    return pattern.sub(lambda match: match[1] + content + match[2], text)
+    return pattern.sub(lambda match: f"{match[1]}{content}\n{match[2]}", text)
 
 
 def make_page(results: Path, page: Path) -> None:
@@ -266,7 +301,8 @@ def draw_curves(axes: Any, rows: list[Row]) -> None:
         x, y = [row["cores"] for row in mine], [row["evaluations"] * DAY for row in mine]
         axes.plot(x, y, color=colour, marker=marker, markersize=4, linewidth=1.5, label=way)
     x = [row["cores"] for row in rows if row["way"] == ways[0]]
-    axes.plot(x, [row["ideal"] * DAY for row in rows if row["way"] == ways[0]], ":", color="#555555", label="engine alone")
+    y = [row["ideal"] * DAY for row in rows if row["way"] == ways[0]]
+    axes.plot(x, y, ":", color="#555555", label="engine alone")
     axes.set(xlabel="cores", ylabel="evaluations a day")
     axes.set_title("One coordinator, one scheduler, small bodies (modelled)", loc="left", fontsize=10)
 

@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+import cluster_plan  # noqa: E402
+import scale  # noqa: E402
+import scale_page  # noqa: E402
 from cluster_model import Cluster, Load, simulate  # noqa: E402
+
+RESULTS = ROOT / "benchmarks" / "results"
+TINY = scale.Size(
+    bodies=("small",),
+    steps=20,
+    seconds=0.0,
+    million=60,
+    chunk=25,
+    growth=(50,),
+    growth_steps=2,
+    populations=(21, 1000),
+    patience=0.0,
+    cluster_workers=(2, 4),
+    cluster_seconds=0.05,
+)
 
 # --- the model ------------------------------------------------------------------------------------------------------
 
@@ -79,3 +100,123 @@ def test_on_one_machine_all_share_its_cores() -> None:
     assert simulate(Cluster(**costs, one_machine=2), load).seconds == pytest.approx(600 * 2, rel=0.1)
     assert simulate(Cluster(**costs, one_machine=8), load).seconds == pytest.approx(600 * 2, rel=0.02)
     assert simulate(Cluster(**costs), load).seconds == pytest.approx(600, rel=0.03)
+
+
+# --- the plan's arithmetic ------------------------------------------------------------------------------------------
+
+
+def way(**changes: float) -> cluster_plan.Way:
+    given: dict[str, Any] = {
+        "name": "a way",
+        "evaluations": 100,
+        "seconds": 1.0,
+        "shards": 1,
+        "bytes_there": 0,
+        "bytes_back": 0,
+    }
+    return cluster_plan.Way(**given | changes)
+
+
+FREE = {f"{who}_{what}": 0.0 for who in ("coordinator", "scheduler", "worker") for what in ("task", "byte")}
+
+
+def test_cores_of_a_target() -> None:
+    """9000 evaluations/s are 90 tasks/s of 1 s each; workers are planned for 90 % of their time."""
+    found = cluster_plan.needs(way(), 9000, FREE)
+    assert (found["tasks_a_second"], found["cores_needed"], found["schedulers"]) == (90, 100, 1)
+    assert found["reached"] == pytest.approx(1 / 0.9, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("changes", "cost", "limit", "busy"),
+    [
+        ({}, {"scheduler_task": 0.02}, "scheduler", 90 * 0.02),
+        ({"optimizer": 0.1, "shards": 4}, {}, "optimizer", 90 / 4 * 0.1),
+        ({"bytes_there": 1e8}, {}, "network", 90 * 1e8 / 1.25e9),
+        ({"bytes_there": 1e6}, {"coordinator_byte": 1e-7}, "coordinator", 90 * 0.1),
+    ],
+)
+def test_schedulers_of_a_target(changes: dict[str, float], cost: dict[str, float], limit: str, busy: float) -> None:
+    """As many as keep each busy for 80 % of its time at most."""
+    found = cluster_plan.needs(way(**changes), 9000, FREE | cost)
+    assert found["limit"] == limit
+    assert found["schedulers"] == np.ceil(busy / 0.8)
+    assert found["share"] == pytest.approx(busy / found["schedulers"])
+
+
+def test_costs_are_found_again_from_rows_that_were_made_of_them() -> None:
+    made = {"coordinator": (1e-3, 1e-9), "scheduler": (2e-3, 2e-9), "worker": (3e-3, 0.0)}
+    rows: list[dict[str, Any]] = [
+        {"seconds": 1.0, "bytes_there": size, "bytes_back": 0.0, **{who: a + size * b for who, (a, b) in made.items()}}
+        for size in (0.0, 1e5, 1e6)
+    ]
+    rows.append({"seconds": 0.0, "wall": 1.0, "tasks": 100})
+    found = cluster_plan.costs(rows)
+    for who, (task, byte) in made.items():
+        assert (found[f"{who}_task"], found[f"{who}_byte"]) == pytest.approx((task, byte), abs=1e-15)
+    assert found["latency"] == pytest.approx(0.01 - 0.006)
+
+
+# --- measuring, and the page ----------------------------------------------------------------------------------------
+
+
+def test_every_part_runs_and_fills_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of it at tiny sizes: a real scheduler with real workers, and fresh processes for the memory."""
+    pytest.importorskip("distributed")
+    for name in scale.PARTS:
+        with monkeypatch.context() as patch:
+            if name == "optimizer":  # many processes, whose start takes longer than all the rest
+                patch.setattr(scale, "in_a_process", lambda function, *arguments: function(*arguments))
+            rows = scale.measure(name, TINY, tmp_path)
+        kept = scale_page.read_rows(tmp_path / f"scale-{name}.csv")
+        assert len(rows) == len(kept) > 0
+        assert scale_page.table(name, tmp_path).count("\n") == (len(rows) + 1 if name in scale_page.TABLES else 0)
+        assert all(value >= 0 for row in rows for value in row.values() if not isinstance(value, str))
+    million = scale_page.read_rows(tmp_path / "scale-million.csv")
+    assert [(row["agents"], row["theta"]) for row in million] == [
+        (50, 50 * 374 * 8),
+        (50, 50 * 374 * 4),
+        (50, 25 * 374 * 4),
+        (60, 25 * 374 * 4),
+    ]
+    page = tmp_path / "scale.md"
+    page.write_text(scale_page.PAGE.read_text(encoding="utf-8"), encoding="utf-8")
+    scale_page.make_page(tmp_path, page)
+    scale_page.make_figure(tmp_path, tmp_path / "scale.png")
+    for name in scale_page.TABLES:
+        assert scale_page.table(name, tmp_path) in page.read_text(encoding="utf-8")
+
+
+def test_a_part_whose_rows_are_missing_says_so(tmp_path: Path) -> None:
+    with pytest.raises(scale_page.Missing, match="scheduler has to be measured first"):
+        scale.measure("plan", TINY, tmp_path)
+
+
+def test_a_page_without_a_mark_is_not_written_over(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected a mark <!-- table: million -->"):
+        scale_page.filled("no marks", RESULTS)
+
+
+def test_the_page_says_what_the_results_say() -> None:
+    page = scale_page.PAGE.read_text(encoding="utf-8")
+    assert scale_page.filled(page, RESULTS) == page
+    assert scale_page.FIGURE.stat().st_size > 10_000
+
+
+def test_the_plan_follows_from_the_measurements() -> None:
+    expected = scale_page.read_rows(RESULTS / "scale-plan.csv")
+    found = list(cluster_plan.plan(scale.Size(), RESULTS))
+    assert len(found) == len(expected)
+    for mine, kept in zip(found, expected, strict=True):
+        for name, value in mine.items():
+            assert kept[name] == (value if isinstance(value, str) else pytest.approx(value, rel=1e-5)), name
+
+
+def test_sentences_of_the_page_have_no_figures_that_a_measurement_would_falsify() -> None:
+    """What the script does not write has the numbers of the task and of the plan's assumptions alone."""
+    page = re.sub(
+        r"<!-- (table|text): .*?<!-- end -->", "", scale_page.PAGE.read_text(encoding="utf-8"), flags=re.DOTALL
+    )
+    text = re.sub(r"```.*?```|10\^9|[Ff]loat\d\d", "", page, flags=re.DOTALL)
+    given = {"1000", "250", "21", "20", "1800", "30", "2017", "10", "90", "80", "1.6", "1", "2", "3", "4"}
+    assert set(re.findall(r"\d+(?:[.,]\d+)?", text)) - given == set()
