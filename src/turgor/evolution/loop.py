@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -19,7 +20,8 @@ from numpy.typing import ArrayLike
 from turgor.errors import InvalidInput, describe
 from turgor.evolution import STRATEGIES
 from turgor.evolution.strategy import Degenerate, Strategy, built_in
-from turgor.runs import Champion, Run, Settings, current_versions
+from turgor.files import NotWritten
+from turgor.runs import RECORD, Champion, Run, Settings, current_versions
 from turgor.simulate import Rollout, Simulator, perturbed
 from turgor.task import Task
 
@@ -88,8 +90,8 @@ def evolve(
         robust_repeats=robust_repeats,
         recipe=None if recipe is None else dict(recipe),
     )
-    run = Run.create(task, settings, out)
-    return _carry_on(run, simulator, optimizer, progress, started)
+    with _told_what_is_kept(out), contextlib.closing(Run.create(task, settings, out)) as run:
+        return _carry_on(run, simulator, optimizer, progress, started)
 
 
 def resume(
@@ -103,33 +105,35 @@ def resume(
     """`run`, taken up where it was left, to its end or to `evaluations`: with the same bits as without the pause.
 
     It goes on from its last checkpoint; what came after is evolved again. `strategy` is what `evolve` was given; None
-    for a built-in one, which run.json names. Raises `InvalidInput` for a run that has no evaluations left, whose
-    strategy is another one or not known, or whose checkpoint cannot be read.
+    for a built-in one, which run.json names. Raises `InvalidInput` for a run that another
+    process writes, that has no evaluations left, whose strategy is another one or not known, or of which no checkpoint
+    can be read.
     """
     started = time.perf_counter()
-    settings = run.settings
-    budget = settings.evaluations if evaluations is None else evaluations
-    if not isinstance(budget, int) or budget < 1:
-        raise InvalidInput("evaluations: expected a whole number, at least 1", describe(budget))
-    if run.status == "done" and run.evaluations >= budget:
-        raise InvalidInput(f"evaluations: expected more than the {run.evaluations} that are done", str(budget))
-    if run.status == "done" and run.note:
-        raise InvalidInput(f"resume: expected a run that can go on; {run.note}")
-    make = _as_started(settings, strategy) if strategy is None or isinstance(strategy, str) else strategy
-    simulator = Simulator(run.task, threads=threads)
-    optimizer = make(run.task.parameter_count, np.random.default_rng(settings.seed))
-    if optimizer.name != settings.strategy:
-        raise InvalidInput(f"strategy: expected {settings.strategy}", optimizer.name)
-    checkpoint = run.read_checkpoint()
-    if checkpoint.state is not None:
-        optimizer.restore(checkpoint.state)
-    if optimizer.population != settings.population:
-        raise InvalidInput(f"strategy: expected a population of {settings.population}", str(optimizer.population))
-    run.settings = msgspec.structs.replace(settings, evaluations=budget, threads=simulator.threads)
-    run.status, run.note, run.versions = "running", None, current_versions()
-    run.write_record()
-    run.go_back(checkpoint)
-    return _carry_on(run, simulator, optimizer, progress, started)
+    run.claim()
+    with _told_what_is_kept(run.path), contextlib.closing(run):
+        settings = run.settings
+        budget = settings.evaluations if evaluations is None else evaluations
+        if not isinstance(budget, int) or budget < 1:
+            raise InvalidInput("evaluations: expected a whole number, at least 1", describe(budget))
+        if run.status == "done" and run.evaluations >= budget:
+            raise InvalidInput(f"evaluations: expected more than the {run.evaluations} that are done", str(budget))
+        if run.status == "done" and run.note:
+            raise InvalidInput(f"resume: expected a run that can go on; {run.note}")
+        make = _as_started(settings, strategy) if strategy is None or isinstance(strategy, str) else strategy
+        simulator = Simulator(run.task, threads=threads)
+        optimizer = make(run.task.parameter_count, np.random.default_rng(settings.seed))
+        if optimizer.name != settings.strategy:
+            raise InvalidInput(f"strategy: expected {settings.strategy}", optimizer.name)
+        checkpoint = run.read_checkpoint()
+        if checkpoint.state is not None:
+            optimizer.restore(checkpoint.state)
+        if optimizer.population != settings.population:
+            raise InvalidInput(f"strategy: expected a population of {settings.population}", str(optimizer.population))
+        run.settings = msgspec.structs.replace(settings, evaluations=budget, threads=simulator.threads)
+        run.status, run.note, run.versions = "running", None, current_versions()
+        run.go_back(checkpoint)
+        return _carry_on(run, simulator, optimizer, progress, started)
 
 
 def _as_started(settings: Settings, name: str | None) -> MakeStrategy:
@@ -165,6 +169,9 @@ def _carry_on(
         except KeyboardInterrupt:
             run.status = "interrupted"
             raise
+        except NotWritten as error:
+            run.status, run.note = "interrupted", str(error)
+            raise
         except Exception as error:
             run.status, run.note = "failed", describe(error)
             raise
@@ -175,10 +182,20 @@ def _carry_on(
             # a strategy that stopped, or was stopped amid its work, has no state to go on from
             whole = run.status != "failed" and run.note is None and not interrupt.forced
             _save(run, optimizer if whole else None, clock)
-            run.close()
     if interrupt.wanted:
         raise KeyboardInterrupt
     return run
+
+
+@contextlib.contextmanager
+def _told_what_is_kept(folder: str | os.PathLike[str] | None) -> Generator[None]:
+    """Adds to a full disk's error what became of the work."""
+    try:
+        yield
+    except NotWritten as error:
+        if folder is None or not (Path(folder) / RECORD).exists():
+            raise
+        raise NotWritten(f"{error}; all written before is whole, and turgor resume {folder} goes on from it") from None
 
 
 def _generations(
