@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from cluster_model import Cluster, Load, simulate
 from scale_page import DAY, Row, find, read_rows
+from scipy.optimize import nnls
 
 STEPS = 1800  # of an evaluation
 NETWORK = 1.25e9  # [byte/s], 10 Gbit/s each way
@@ -93,19 +94,26 @@ def ways(body: str, results: Path) -> list[Way]:
 
 
 def costs(rows: list[Row]) -> dict[str, float]:
-    """What a shard and a byte cost each process, fitted to the CPU times of all rows of the real scheduler; and the
-    latency, from the one in which empty shards went one by one."""
-    found, empty = {}, find(rows, seconds=0.0)
-    rows = [row for row in rows if row is not empty]
-    size = np.array([row["bytes_there"] + row["bytes_back"] for row in rows])
-    for who in ("coordinator", "scheduler", "worker"):
-        seconds = np.array([row[who] for row in rows])
-        # relative errors count, so that small shards do as well
-        terms = np.stack([np.ones_like(size), size], axis=1) / seconds[:, None]
-        (task, byte), *_ = np.linalg.lstsq(terms, np.ones_like(seconds), rcond=None)
-        found |= {f"{who}_task": float(task), f"{who}_byte": max(float(byte), 0.0)}
-    working = sum(found[f"{who}_task"] for who in ("coordinator", "scheduler", "worker"))
+    """What a shard and a byte cost each process [s], and the latency [s], of which `Cluster` is made."""
+    fitted = {who: fit(rows, who) for who in ("coordinator", "scheduler", "worker")}
+    found = {}
+    for who, (task, byte, idle) in fitted.items():
+        # a process that is busy with itself for a part of its time takes longer for everything else
+        found |= {f"{who}_task": task / (1 - idle), f"{who}_byte": byte / (1 - idle)}
+    empty = find(rows, seconds=0.0)  # one shard at a time, without work
+    working = sum(task for task, _, _ in fitted.values())
     return {**found, "latency": max(empty["wall"] / empty["tasks"] - working, 0.0)}
+
+
+def fit(rows: list[Row], who: str) -> tuple[float, float, float]:
+    """CPU time of a process for a shard [s] and for a byte [s], and the part of its time [1] that it is busy with
+    itself: least squares of the relative errors over all rows of the real scheduler, none negative."""
+    seconds = np.array([row[who] for row in rows])
+    size = np.array([row["bytes_there"] + row["bytes_back"] for row in rows])
+    wall = np.array([row["wall"] / row["tasks"] for row in rows])
+    terms = np.stack([np.ones_like(size), size / 1e6, wall], axis=1) / seconds[:, None]
+    (task, megabyte, idle), _ = nnls(terms, np.ones_like(seconds))
+    return float(task), float(megabyte) / 1e6, float(idle)
 
 
 def predict(rows: list[Row]) -> list[float]:

@@ -214,13 +214,14 @@ def scheduler_summary(results: Path) -> str:
     rows = rows_of("scheduler", results)
     cost = cluster_plan.costs(rows)
     ratios = [row["ratio"] for row in rows if row["seconds"]]
+    fitted = {who: cluster_plan.fit(rows, who) for who in ("scheduler", "coordinator", "worker")}
     told = [
-        f"{who} {milliseconds(cost[f'{who}_task'])} ms and {milliseconds(1e6 * cost[f'{who}_byte'])} ms a MB"
-        for who in ("scheduler", "coordinator", "worker")
+        f"{who} {milliseconds(task)} ms, {milliseconds(1e6 * byte)} ms a MB and {percent(idle)} of its time anyway"
+        for who, (task, byte, idle) in fitted.items()
     ]
     return (
-        f"Fitted to all rows, a shard costs {', '.join(told)}; {milliseconds(cost['latency'])} ms pass in which nobody "
-        f"works. A scheduler with a core of its own and shards of few bytes is at its end at "
+        f"Fitted to all rows, a shard costs {'; '.join(told)}. For {milliseconds(cost['latency'])} ms of a shard's way "
+        f"nobody works. A scheduler with a core of its own and shards of few bytes is at its end at "
         f"{1 / cost['scheduler_task']:,.0f} shards/s; this machine, whose {rows[0]['cores']:.0f} cores do all of it, "
         f"reached {max(row['tasks'] / row['wall'] for row in rows):,.0f}. The model's time is "
         f"{min(ratios):.2f} to {max(ratios):.2f} of the measured, {statistics.median(ratios):.2f} in the median."

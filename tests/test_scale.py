@@ -145,15 +145,16 @@ def test_schedulers_of_a_target(changes: dict[str, float], cost: dict[str, float
 
 
 def test_costs_are_found_again_from_rows_that_were_made_of_them() -> None:
-    made = {"coordinator": (1e-3, 1e-9), "scheduler": (2e-3, 2e-9), "worker": (3e-3, 0.0)}
-    rows: list[dict[str, Any]] = [
-        {"seconds": 1.0, "bytes_there": size, "bytes_back": 0.0, **{who: a + size * b for who, (a, b) in made.items()}}
-        for size in (0.0, 1e5, 1e6)
-    ]
-    rows.append({"seconds": 0.0, "wall": 1.0, "tasks": 100})
+    """Of a shard [s], of a byte [s], and the part of a core that a process takes for nothing."""
+    made = {"coordinator": (1e-3, 1e-9, 0.0), "scheduler": (2e-3, 2e-9, 0.1), "worker": (3e-3, 0.0, 0.2)}
+    rows: list[dict[str, Any]] = []
+    for seconds, size, wall in [(1.0, 0.0, 0.5), (1.0, 1e5, 0.1), (1.0, 1e6, 0.02), (0.0, 0.0, 0.01)]:
+        spent = {who: task + size * byte + wall * idle for who, (task, byte, idle) in made.items()}
+        rows.append({"seconds": seconds, "bytes_there": size, "bytes_back": 0.0, "wall": 5 * wall, "tasks": 5, **spent})
     found = cluster_plan.costs(rows)
-    for who, (task, byte) in made.items():
-        assert (found[f"{who}_task"], found[f"{who}_byte"]) == pytest.approx((task, byte), abs=1e-15)
+    for who, (task, byte, idle) in made.items():
+        assert cluster_plan.fit(rows, who) == pytest.approx((task, byte, idle), abs=1e-12)
+        assert (found[f"{who}_task"], found[f"{who}_byte"]) == pytest.approx((task / (1 - idle), byte / (1 - idle)))
     assert found["latency"] == pytest.approx(0.01 - 0.006)
 
 
