@@ -93,27 +93,31 @@ def ways(body: str, results: Path) -> list[Way]:
     ]
 
 
-def costs(rows: list[Row]) -> dict[str, float]:
-    """What a shard and a byte cost each process [s], and the latency [s], of which `Cluster` is made."""
-    fitted = {who: fit(rows, who) for who in ("coordinator", "scheduler", "worker")}
-    found = {}
-    for who, (task, byte, idle) in fitted.items():
+def costs(rows: list[Row], together: int = 1) -> dict[str, float]:
+    """What a shard and a byte cost each process [s], and the latency [s], of which `Cluster` is made; `together`: the
+    workers that share a process."""
+    found, working = {}, 0.0
+    for who in ("coordinator", "scheduler", "worker"):
+        task, byte, idle, worker = fit(rows, who)
         # a process that is busy with itself for a part of its time takes longer for everything else
-        found |= {f"{who}_task": task / (1 - idle), f"{who}_byte": byte / (1 - idle)}
+        slower = 1 / (1 - min(idle + worker * together, 0.95))
+        found |= {f"{who}_task": task * slower, f"{who}_byte": byte * slower}
+        working += task
     empty = find(rows, seconds=0.0)  # one shard at a time, without work
-    working = sum(task for task, _, _ in fitted.values())
     return {**found, "latency": max(empty["wall"] / empty["tasks"] - working, 0.0)}
 
 
-def fit(rows: list[Row], who: str) -> tuple[float, float, float]:
+def fit(rows: list[Row], who: str) -> tuple[float, float, float, float]:
     """CPU time of a process for a shard [s] and for a byte [s], and the part of its time [1] that it is busy with
-    itself: least squares of the relative errors over all rows of the real scheduler, none negative."""
+    itself, and with each worker in it: least squares of the relative errors over all rows of the real scheduler, none
+    negative."""
     seconds = np.array([row[who] for row in rows])
     size = np.array([row["bytes_there"] + row["bytes_back"] for row in rows])
     wall = np.array([row["wall"] / row["tasks"] for row in rows])
-    terms = np.stack([np.ones_like(size), size / 1e6, wall], axis=1) / seconds[:, None]
-    (task, megabyte, idle), _ = nnls(terms, np.ones_like(seconds))
-    return float(task), float(megabyte) / 1e6, float(idle)
+    inside = np.array([row["workers"] if who == "worker" else 0 for row in rows])
+    terms = np.stack([np.ones_like(size), size / 1e6, wall, wall * inside], axis=1) / seconds[:, None]
+    (task, megabyte, idle, worker), _ = nnls(terms, np.ones_like(seconds))
+    return float(task), float(megabyte) / 1e6, float(idle), float(worker)
 
 
 def predict(rows: list[Row]) -> list[float]:
@@ -123,17 +127,19 @@ def predict(rows: list[Row]) -> list[float]:
         numbers = {name: row[name] for name in Load.__struct_fields__}
         for name in ("evolutions", "generations", "shards"):
             numbers[name] = int(numbers[name])
-        cluster = Cluster(workers=int(row["workers"]), **costs(rows), one_machine=int(row["cores"]))
+        workers = int(row["workers"])
+        cluster = Cluster(workers=workers, **costs(rows, workers), one_machine=int(row["cores"]))
         found.append(simulate(cluster, Load(**numbers)).seconds)
     return found
 
 
 def evaluations(way: Way, workers: int, cost: dict[str, float]) -> float:
-    """Evaluations/s of one coordinator and scheduler with `workers` workers, as modelled: two tasks in flight each."""
-    evolutions = math.ceil(2 * workers / way.shards)
+    """Evaluations/s of one coordinator and scheduler with `workers` workers, as modelled: two tasks in flight each,
+    and two evolutions more for the optimizer."""
+    evolutions = math.ceil(2 * workers / way.shards) + 2
     load = Load(
         evolutions=evolutions,
-        generations=max(4, math.ceil(2000 / (evolutions * way.shards))),
+        generations=max(8, math.ceil(2000 / (evolutions * way.shards))),
         shards=way.shards,
         seconds=way.seconds,
         bytes_there=way.bytes_there,

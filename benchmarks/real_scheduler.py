@@ -27,6 +27,7 @@ from scale_page import find, read_rows
 from turgor.bench.parts import Skipped
 from turgor.simulate import available_cores
 
+REPEATS = 2  # of every load
 HERE = str(Path(__file__).parent)  # where the scheduler finds `shard`
 
 
@@ -112,7 +113,10 @@ async def run_loads(workers: int, loads: list[Load]) -> list[tuple[Load, dict[st
                     try:
                         await client.wait_for_workers(workers)
                         await run_load(client, Load(evolutions=8, generations=4, shards=4, seconds=0.0))  # warms up
-                        found = [(load, await run_load(client, load)) for load in loads]
+                        rounds = [[await run_load(client, load) for load in loads] for _ in range(REPEATS)]
+                        # the fastest counts: other work on the machine only ever slows things down
+                        fastest = [min(same, key=lambda each: each["wall"]) for same in zip(*rounds, strict=True)]
+                        found = list(zip(loads, fastest, strict=True))
                     finally:
                         end.set()
                         host.join()

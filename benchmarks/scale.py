@@ -56,7 +56,7 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     patience: float = 1.5  # [s] of generations of one strategy, about
     memory: float = 12e9  # [byte] that an optimizer may take, about
     cluster_workers: tuple[int, ...] = (4, 16, 64, 256)
-    cluster_seconds: float = 3.0  # of every row of the scheduler, about
+    cluster_seconds: float = 2.0  # of every load of the scheduler, about
 
 
 QUICK = Size(

@@ -217,7 +217,7 @@ def scheduler_summary(results: Path) -> str:
     fitted = {who: cluster_plan.fit(rows, who) for who in ("scheduler", "coordinator", "worker")}
     told = [
         f"{who} {milliseconds(task)} ms, {milliseconds(1e6 * byte)} ms a MB and {percent(idle)} of its time anyway"
-        for who, (task, byte, idle) in fitted.items()
+        for who, (task, byte, idle, _) in fitted.items()
     ]
     return (
         f"Fitted to all rows, a shard costs {'; '.join(told)}. For {milliseconds(cost['latency'])} ms of a shard's way "
@@ -291,7 +291,6 @@ def make_figure(results: Path, file: Path) -> None:
         axes.set(xscale="log", yscale="log")
         axes.grid(color="#dddddd", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False, fontsize=8)
     figure.savefig(file)
 
 
@@ -305,6 +304,7 @@ def draw_curves(axes: Any, rows: list[Row]) -> None:
     y = [row["ideal"] * DAY for row in rows if row["way"] == ways[0]]
     axes.plot(x, y, ":", color="#555555", label="engine alone")
     axes.set(xlabel="cores", ylabel="evaluations a day")
+    axes.legend(frameon=False, fontsize=8, loc="lower right")
     axes.set_title("One coordinator, one scheduler, small bodies (modelled)", loc="left", fontsize=10)
 
 
@@ -318,4 +318,5 @@ def draw_optimizers(axes: Any, rows: list[Row], engine: list[Row]) -> None:
     rate = max(row["rate"] for row in engine if row["parameters"] == parameters)
     axes.axhline(1e6 * 1800 / rate, linestyle=":", color="#555555", label="simulating it on one core")
     axes.set(xlabel="population", ylabel="ask + tell [µs an agent]")
+    axes.legend(frameon=False, fontsize=8)
     axes.set_title(f"What an agent costs the optimizer, {parameters:.0f} parameters", loc="left", fontsize=10)

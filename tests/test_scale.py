@@ -124,7 +124,8 @@ def test_cores_of_a_target() -> None:
     """9000 evaluations/s are 90 tasks/s of 1 s each; workers are planned for 90 % of their time."""
     found = cluster_plan.needs(way(), 9000, FREE)
     assert (found["tasks_a_second"], found["cores_needed"], found["schedulers"]) == (90, 100, 1)
-    assert found["reached"] == pytest.approx(1 / 0.9, rel=0.01)
+    # 202 evolutions of 10 tasks each are 2020 tasks: 100 workers do them in 21 rounds of 1 s
+    assert found["reached"] == pytest.approx(2020 * 100 / 21 / 9000)
 
 
 @pytest.mark.parametrize(
@@ -145,17 +146,22 @@ def test_schedulers_of_a_target(changes: dict[str, float], cost: dict[str, float
 
 
 def test_costs_are_found_again_from_rows_that_were_made_of_them() -> None:
-    """Of a shard [s], of a byte [s], and the part of a core that a process takes for nothing."""
-    made = {"coordinator": (1e-3, 1e-9, 0.0), "scheduler": (2e-3, 2e-9, 0.1), "worker": (3e-3, 0.0, 0.2)}
+    """Of a shard [s], of a byte [s], and the parts of a core that a process takes for itself and for each worker."""
+    made = {"coordinator": (1e-3, 1e-9, 0, 0), "scheduler": (2e-3, 2e-9, 0.1, 0), "worker": (3e-3, 0, 0.2, 0.002)}
     rows: list[dict[str, Any]] = []
-    for seconds, size, wall in [(1.0, 0.0, 0.5), (1.0, 1e5, 0.1), (1.0, 1e6, 0.02), (0.0, 0.0, 0.01)]:
-        spent = {who: task + size * byte + wall * idle for who, (task, byte, idle) in made.items()}
-        rows.append({"seconds": seconds, "bytes_there": size, "bytes_back": 0.0, "wall": 5 * wall, "tasks": 5, **spent})
-    found = cluster_plan.costs(rows)
-    for who, (task, byte, idle) in made.items():
-        assert cluster_plan.fit(rows, who) == pytest.approx((task, byte, idle), abs=1e-12)
-        assert (found[f"{who}_task"], found[f"{who}_byte"]) == pytest.approx((task / (1 - idle), byte / (1 - idle)))
-    assert found["latency"] == pytest.approx(0.01 - 0.006)
+    for seconds, size, wall, workers in [(1, 0, 0.5, 4), (1, 1e5, 0.1, 4), (1, 1e6, 0.02, 64), (0, 0, 0.01, 4)]:
+        row = {"seconds": seconds, "bytes_there": size, "bytes_back": 0, "wall": 5 * wall, "tasks": 5}
+        for who, (task, byte, idle, worker) in made.items():
+            row[who] = task + size * byte + wall * (idle + workers * worker)
+        rows.append({**row, "workers": workers})
+    for who, expected in made.items():
+        assert cluster_plan.fit(rows, who) == pytest.approx(expected, abs=1e-12)
+    alone, together = cluster_plan.costs(rows), cluster_plan.costs(rows, 64)
+    assert alone["scheduler_task"] == together["scheduler_task"] == pytest.approx(2e-3 / 0.9)
+    assert alone["scheduler_byte"] == pytest.approx(2e-9 / 0.9)
+    assert alone["worker_task"] == pytest.approx(3e-3 / (1 - 0.202))
+    assert together["worker_task"] == pytest.approx(3e-3 / (1 - 0.328))
+    assert alone["latency"] == pytest.approx(0.01 - 0.006)
 
 
 # --- measuring, and the page ----------------------------------------------------------------------------------------
