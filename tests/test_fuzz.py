@@ -134,6 +134,9 @@ FOUND: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: settings_of(robust_repeats=10**12), "robust_repeats: expected a whole number",
     ),
     "an endless value in a message": (lambda: task_from_json(b'{"name":"%s"}' % (b"x" * 5000)), "task: "),
+    "a replay of 2^64 masses": (
+        lambda: read_replay(replay_with("masses", 2**64)), "replay: expected the bytes of a replay"
+    ),
     "a replay that unpacks to 100 MB": (lambda: read_replay(bomb()), "replay: expected the bytes of a replay"),
 }  # fmt: skip
 
@@ -167,6 +170,13 @@ def stepping() -> Simulator:
 def settings_of(**changes: Any) -> Settings:
     fields = {"evaluations": 10, "seed": 0, "strategy": "cma-es", "population": 4, "threads": 1}
     return Settings(**(fields | changes))
+
+
+def replay_with(name: str, value: Any) -> bytes:
+    data = fuzzing._replay()
+    end = 8 + struct.unpack("<I", data[4:8])[0]
+    text = msgspec.json.encode({**msgspec.json.decode(data[8:end]), name: value})
+    return data[:4] + struct.pack("<I", len(text)) + text + data[end:]
 
 
 def bomb() -> bytes:

@@ -229,7 +229,7 @@ class Replay(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 Kind = Literal["int32", "int16", "uint8", "float32"]
-BROKEN = (ValueError, KeyError, TypeError, struct.error, zlib.error, msgspec.DecodeError)
+BROKEN = (ValueError, KeyError, TypeError, OverflowError, struct.error, zlib.error, msgspec.DecodeError)
 
 
 def read_replay(data: bytes) -> Replay:
