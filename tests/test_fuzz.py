@@ -31,7 +31,7 @@ from turgor.physics.ground import cut_into_columns
 from turgor.runs import Run, Settings
 from turgor.scene import Scene, flat, hills
 from turgor.simulate import Simulator
-from turgor.task import make_task, task_from_json, task_to_json
+from turgor.task import Leave, make_task, task_from_json, task_to_json
 from turgor.web.replay import read_replay
 
 quick = settings(derandomize=True, deadline=None, max_examples=100, database=None)
@@ -89,6 +89,7 @@ FOUND: dict[str, tuple[Callable[[], Any], str]] = {
     "friction of the ground of words": (lambda: Scene([], friction="much"), "segments: expected numbers"),
     "a ragged start": (lambda: msgspec.structs.replace(TASK, position=RAGGED), "position: expected numbers"),
     "a pressure unit of 1e300": (lambda: make_task("flat", pressure_unit=1e300), "pressure_unit: expected a number"),
+    "an end beyond float32": (lambda: Leave(half_width=1e154), "half_width: expected 0 m or more, up to 1e+06 m"),
     "endless iterations": (
         lambda: make_task("flat", velocity_iterations=10**9), "a number from 0 to 1000; got 1000000000",
     ),

@@ -44,6 +44,11 @@ class Leave(msgspec.Struct, frozen=True, tag="leave"):
 
     half_width: float
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.half_width <= scenes.LARGEST_COORDINATE:
+            expected = f"half_width: expected 0 m or more, up to {scenes.LARGEST_COORDINATE:g} m"
+            raise InvalidInput(expected, describe(self.half_width))
+
 
 class Task(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """One evaluation, exactly. Start velocities are zero.
