@@ -138,6 +138,9 @@ FOUND: dict[str, tuple[Callable[[], Any], str]] = {
     "a replay of 2^64 masses": (
         lambda: read_replay(replay_with("masses", 2**64)), "replay: expected the bytes of a replay"
     ),
+    "a replay of endless springs": (
+        lambda: read_replay(replay_with("spring_range", [-1e308, 1e308])), "replay: expected the bytes of a replay"
+    ),
     "a replay that unpacks to 100 MB": (lambda: read_replay(bomb()), "replay: expected the bytes of a replay"),
 }  # fmt: skip
 

@@ -30,6 +30,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from turgor.arrays import LARGEST
 from turgor.body import SIZES
 from turgor.control import CONTROLLERS
 from turgor.errors import InvalidInput, describe, one_of
@@ -253,6 +254,8 @@ def read_replay(data: bytes) -> Replay:
             first += count * kind.itemsize
         moved = np.concatenate([arrays["origin"][None], arrays["position"]]).astype(np.int64)
         low, high = header.spring_range
+        if not max(abs(low), abs(high), *map(abs, header.rest)) <= LARGEST:
+            raise ValueError("springs of no length")
         return Replay(
             header=header,
             position=moved.cumsum(axis=0) * MILLIMETRE,
