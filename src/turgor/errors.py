@@ -10,6 +10,10 @@ class InvalidInput(ValueError):
         super().__init__(expected if got is None else f"{expected}; got {got}")
 
 
+class WorkLost(InvalidInput):
+    """The machines that did the work are gone: what was in hand is lost, what was done before is not."""
+
+
 def describe(value: object) -> str:
     """A short, one-line form of `value` for an error message."""
     text = " ".join(str(value).split())

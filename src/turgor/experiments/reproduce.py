@@ -57,13 +57,15 @@ def reproduce(
     videos: bool = True,
     progress: Callable[[Progress], object] | None = None,
     say: Callable[[str], object] = lambda text: None,
+    executor: Any = None,
 ) -> Path:
     """Path of the report on `questions` ("rq0", "rq1", "rq2", "studies"), after all runs that it needs.
 
     The campaign's folder is `out`. Started again it goes on where it stopped, and runs nothing twice; more seeds,
     bodies or questions add runs. The report tells of what this call asks for. Its numbers do not depend on `threads`
     (cores in use; None: all) or on interruptions. `progress` is called as runs go on, `say` with a line for every
-    other part.
+    other part. `executor`: a Dask `Client`, whose workers then do the runs, with the same results (docs/cluster.md);
+    tables, figures, videos and report are made here.
 
     Processes are spawned: call it under `if __name__ == "__main__"`. Raises `InvalidInput` for a folder that holds
     something else, or runs with other settings; `KeyboardInterrupt` once every run has kept what it has.
@@ -72,7 +74,7 @@ def reproduce(
     entries = make_plan(questions, bodies, seeds, evaluations)
     _claim_folder(folder)
     load_kernel()  # compiles it, if it has to be, before every process would
-    measured = run_entries(folder, entries, threads, progress)
+    measured = run_entries(folder, entries, threads, progress, executor)
 
     with _drawers(threads) as pool:
         films = [pool.submit(_film, m, folder / "videos") for m in _chosen(measured)] if videos else []
