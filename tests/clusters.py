@@ -53,7 +53,6 @@ def once_at_work(client: Any, process: subprocess.Popen[bytes], then: Callable[[
     def watch() -> None:
         address = address_of(client, process)
         wait_until(lambda: client.processing().get(address))
-        time.sleep(0.05)
         then()
 
     thread = threading.Thread(target=watch)

@@ -30,8 +30,7 @@ def connect(address: str) -> Generator[Client]:
     """
     count = _check_address(address)
     distributed = load_dask()
-    # turgor tells what happens in lines of its own; Dask's warnings about the same would stand between them
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _quieten()
     with contextlib.ExitStack() as open_until_the_end:
         if count is None:
             client = _client_of(distributed, address)
@@ -41,7 +40,8 @@ def connect(address: str) -> Generator[Client]:
         try:
             yield client
         finally:
-            client.close(timeout=CLOSE_TIMEOUT)
+            with contextlib.suppress(TimeoutError):
+                client.close(timeout=CLOSE_TIMEOUT)
 
 
 def load_dask() -> Any:
@@ -63,6 +63,13 @@ def check_client(executor: Any) -> Client:
     if executor.status != "running":
         raise InvalidInput("executor: expected a Dask Client that is connected", f"one that is {executor.status}")
     return executor
+
+
+def _quieten() -> None:
+    """Leaves it to turgor to tell what happens to the cluster: Dask's own lines would stand between its."""
+    for name in list(logging.root.manager.loggerDict):
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _check_address(text: str) -> int | None:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 PULSE = 1.0  # [s], between two looks at who is there
 DEATHS = 3  # of so many sets of workers by the same job: it is the job
+LARGEST_MESSAGE = "1 GB"  # that Dask does not warn of: the state of a large run is 29 MB
 REMEMBERED = 100  # answers, for how long one usually takes
 
 T = TypeVar("T")
@@ -53,7 +54,7 @@ def patience() -> Patience:
     for name, default in msgspec.structs.asdict(Patience()).items():
         given = dask.config.get(f"turgor.{name.replace('_', '-')}", default)
         try:
-            chosen[name] = float(given) if name == "answer_factor" else parse_timedelta(given, "s")
+            chosen[name] = float(given) if name == "answer_factor" else parse_timedelta(given, "s") or 0.0
         except (TypeError, ValueError, KeyError):
             chosen[name] = 0.0
         if not chosen[name] > 0:
@@ -165,10 +166,14 @@ class Crew:
 
     def _try(self, job: _Job, without: set[str]) -> None:
         """One more attempt, by other workers than `without` where there are others."""
+        import dask
+
+        if self._client.status != "running":
+            raise self._scheduler_lost()
         others = [worker for worker in self._workers if worker not in without] if without else []
-        future = self._client.submit(
-            perform, own_versions(), job.function, job.arguments, pure=False, workers=others or None
-        )
+        where: dict[str, Any] = {"workers": others, "allow_other_workers": True} if others else {}
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": LARGEST_MESSAGE}):
+            future = self._client.submit(perform, own_versions(), job.function, job.arguments, pure=False, **where)
         job.attempts.append(_Attempt(future, self._begin(_answer(future))))
         job.since = time.monotonic()
 
@@ -176,11 +181,11 @@ class Crew:
         """The first answer to a job, which is then forgotten; None if there is none yet."""
         for attempt in [attempt for attempt in job.attempts if attempt.answer.done()]:
             job.attempts.remove(attempt)
-            error = attempt.answer.exception()
+            found, error = attempt.answer.result()
             if error is not None:
                 self._weigh(job, error)
                 continue
-            worker, answer = attempt.answer.result()
+            worker, answer = found
             self._silent.discard(worker)
             self._took.append(time.monotonic() - job.given)
             self._forget(job)
@@ -188,7 +193,7 @@ class Crew:
             return job.name, answer
         return None
 
-    def _weigh(self, job: _Job, error: BaseException) -> None:
+    def _weigh(self, job: _Job, error: Exception) -> None:
         """What an attempt's `error` means: another attempt, or the end."""
         from distributed import KilledWorker
 
@@ -275,9 +280,12 @@ class Crew:
 
     def _ask(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """What the scheduler says to a question; raises `WorkLost` if it is silent."""
-        answer = self._begin(coroutine)
+        answer, until = self._begin(coroutine), time.monotonic() + self._patience.scheduler_timeout
+        while self._client.status == "running" and time.monotonic() < until:
+            if concurrent.futures.wait([answer], PULSE / 10).done:
+                break
         try:
-            return answer.result(self._patience.scheduler_timeout)
+            return answer.result(0)
         except (OSError, TimeoutError, concurrent.futures.CancelledError):
             answer.cancel()
             raise self._scheduler_lost() from None
@@ -299,13 +307,16 @@ class _Gone(Exception):
     """A future was cancelled by the end of its scheduler."""
 
 
-async def _answer(future: Future) -> Any:
+async def _answer(future: Future) -> tuple[Any, Exception | None]:
+    """What a future brings, or the error that it brings."""
     try:
-        return await future
+        return await future, None
     except (asyncio.CancelledError, concurrent.futures.CancelledError):
         if future.cancelled():
-            raise _Gone from None
+            return None, _Gone()
         raise
+    except Exception as error:
+        return None, error
 
 
 async def _threads_of(client: Client) -> dict[str, int]:
