@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import re
 import shutil
 import signal
@@ -280,7 +281,7 @@ def test_a_worker_of_another_version_is_refused(task: Task, cluster: RealCluster
         address = address_of(client, stranger)
         with pytest.raises(InvalidInput) as error:
             evolve(task, POPULATION, strategy=SPREAD, executor=client)
-        expected = f"cluster: expected turgor 0.1.0 on every worker, as it is here; got 9.9.9 on {address}"
+        expected = f"cluster: expected turgor 0.1.0 on every worker, as here; got 9.9.9 on {address}"
         assert str(error.value) == expected
         with pytest.raises(InvalidInput, match=re.escape(expected)):
             run_entries(tmp_path / "campaign", ENTRIES, executor=client)
@@ -315,6 +316,20 @@ def test_a_worker_of_edited_sources_is_refused(task: Task, cluster: RealCluster,
             InvalidInput, match=r"expected turgor's sources [0-9a-f]{12} .*; got [0-9a-f]{12} on tcp://"
         ):
             evolve(task, POPULATION, strategy=SPREAD, executor=client)
+
+
+@pytest.mark.skipif(
+    platform.machine() not in ("x86_64", "AMD64") or sys.platform == "darwin", reason="needs OpenBLAS on x86-64"
+)
+def test_a_processor_that_calculates_differently_gets_simulations_but_no_whole_run(
+    task: Task, alone: tuple[Any, ...], cluster: RealCluster, tmp_path: Path
+) -> None:
+    with connect(cluster.address) as client:
+        cluster.add_worker({"OPENBLAS_CORETYPE": "Nehalem"})
+        client.wait_for_workers(1, timeout=60)
+        assert bits_of(evolve(task, GENERATIONS * POPULATION, strategy=SPREAD, executor=client)) == alone
+        with pytest.raises(InvalidInput, match=r"the BLAS kernels .*; got .*Nehalem.* on tcp://"):
+            run_entries(tmp_path / "campaign", ENTRIES, executor=client)
 
 
 # --- Ctrl-C -------------------------------------------------------------------------------------------------------

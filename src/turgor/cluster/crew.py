@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import msgspec
 
 from turgor.cluster.connect import check_client
-from turgor.cluster.stand import COMPARED, check_versions, own_versions, python_of
+from turgor.cluster.stand import COMPARED, check_versions, own_kernels, own_versions, python_of
 from turgor.errors import InvalidInput, WorkLost, describe
 
 if TYPE_CHECKING:
@@ -82,12 +82,16 @@ class _Job:
 class Crew:
     """The workers of a Dask client, at work on jobs. `wait` returns answers in whatever order they come."""
 
-    def __init__(self, client: Client) -> None:
-        """Raises `InvalidInput` for a `client` that is none, or a worker of other versions; `WorkLost` where the
-        scheduler is silent."""
+    def __init__(self, client: Client, *, whole_runs: bool = False) -> None:
+        """`whole_runs`: jobs are more than simulations, so that all processors have to calculate alike.
+
+        Raises `InvalidInput` for a `client` that is none, or a worker of other versions; `WorkLost` where the scheduler
+        is silent.
+        """
         self._client = check_client(client)
         self._loop = cast(Any, client.loop).asyncio_loop
         self._patience = patience()
+        self._expected = {**own_versions(), **(own_kernels() if whole_runs else {})}
         self._jobs: dict[Any, _Job] = {}
         self._workers: dict[str, int] = {}  # threads of each, by its address
         self._silent: set[str] = set()  # workers that owe an answer for too long
@@ -173,7 +177,7 @@ class Crew:
         others = [worker for worker in self._workers if worker not in without] if without else []
         where: dict[str, Any] = {"workers": others, "allow_other_workers": True} if others else {}
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": LARGEST_MESSAGE}):
-            future = self._client.submit(perform, own_versions(), job.function, job.arguments, pure=False, **where)
+            future = self._client.submit(perform, self._expected, job.function, job.arguments, pure=False, **where)
         job.attempts.append(_Attempt(future, self._begin(_answer(future))))
         job.since = time.monotonic()
 
@@ -295,11 +299,14 @@ class Crew:
 
 
 def perform(expected: dict[str, str], function: Callable[..., T], arguments: tuple[Any, ...]) -> tuple[str, T]:
-    """Address of the worker that does a job, and the answer. Raises `InvalidInput` on a worker of other versions."""
+    """Address of the worker that does a job, and the answer. Raises `InvalidInput` on a worker of other versions
+    or, where that is asked for, other kernels."""
     from distributed import get_worker
 
     worker = get_worker().address
     check_versions(worker, own_versions(), expected)
+    if not expected.keys() <= own_versions().keys():
+        check_versions(worker, own_kernels(), expected)
     return worker, function(*arguments)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import importlib
 import importlib.metadata
 import platform
 from collections.abc import Mapping
@@ -13,6 +15,10 @@ import turgor
 from turgor.errors import InvalidInput
 from turgor.runs import PACKAGES
 
+HINTS = {
+    "the BLAS kernels": " (OPENBLAS_CORETYPE chooses)",
+    "the loops of NumPy": " (NPY_DISABLE_CPU_FEATURES chooses)",
+}
 COMPARED = (*PACKAGES, "scipy")
 
 
@@ -23,13 +29,35 @@ def own_versions() -> dict[str, str]:
     return {**found, "python": python_of(platform.python_version()), "sources": _sources()}
 
 
+@cache
+def own_kernels() -> dict[str, str]:
+    """Which of their kernels OpenBLAS and NumPy chose for this processor: what a whole run's bits depend on, because its
+    strategy does. The engine's own bits do not."""
+    from threadpoolctl import threadpool_info
+
+    importlib.import_module("scipy.linalg")  # has a BLAS of its own, which is known once it is loaded
+    blas = {
+        found.get("architecture", found["internal_api"]) for found in threadpool_info() if found["user_api"] == "blas"
+    }
+    loops: set[str] = set()
+    with contextlib.suppress(ImportError):  # from NumPy 2.1 on
+        introspect = importlib.import_module("numpy.lib.introspect")
+        found = introspect.opt_func_info(signature="float64").values()
+        loops = {kinds["current"].partition("(")[0] for function in found for kinds in function.values()}
+    return {"the BLAS kernels": _joined(blas), "the loops of NumPy": _joined(loops)}
+
+
+def _joined(names: set[str]) -> str:
+    return "+".join(sorted(names)) or "unknown"
+
+
 def check_versions(worker: str, found: Mapping[str, str | None], expected: Mapping[str, str]) -> None:
-    """Raises `InvalidInput` that names the address of a `worker` that has other versions, and both versions."""
+    """Raises `InvalidInput` that names the address of a `worker` that has other versions, or kernels, and both of them."""
     for name, version in expected.items():
         if name in found and found[name] != version:
             what = "turgor's sources" if name == "sources" else name
             raise InvalidInput(
-                f"cluster: expected {what} {version} on every worker, as it is here",
+                f"cluster: expected {what} {version} on every worker, as here{HINTS.get(name, '')}",
                 f"{found[name] or 'none'} on {worker}",
             )
 

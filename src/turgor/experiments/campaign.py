@@ -246,7 +246,7 @@ def _on_cluster(folder: Path, costs: Mapping[Entry, float], executor: Any, displ
     from turgor.cluster.crew import Crew
     from turgor.experiments.pieces import run_in_pieces
 
-    crew = Crew(executor)
+    crew = Crew(executor, whole_runs=True)
     try:
         return run_in_pieces(folder, partial(open_run, folder), Schedule(costs, max(crew.workers, 1)), crew, display)
     except WorkLost as lost:
