@@ -70,3 +70,9 @@ def wait_until(true: Callable[[], object], seconds: float = 60.0) -> None:
     while not true():
         assert time.monotonic() < until, "waited in vain"
         time.sleep(0.02)
+
+
+def errors_of(stderr: str) -> str:
+    """What a command said on stderr, apart from a notice of the engine's, which a busy machine brings about."""
+    lines = stderr.splitlines(keepends=True)
+    return "".join(line for line in lines if not line.startswith("turgor: compiling the engine"))

@@ -25,6 +25,7 @@ from turgor.control import Distributed
 from turgor.evolution import STRATEGIES
 from turgor.evolution.loop import evolve
 from turgor.evolution.strategy import built_in
+from turgor.files import read_arrays, write_arrays
 from turgor.runs import Run
 from turgor.simulate import Simulator
 from turgor.task import TASKS, make_task, variant_names
@@ -182,8 +183,8 @@ def test_errors_are_one_line(
     (here / "full" / "file").write_text("")
     for name in ("made", "broken", "young"):
         shutil.copytree(made, here / name)
-    with np.load(made / "champion.npz") as arrays:
-        np.savez(here / "broken" / "champion.npz", **{**arrays, "theta": np.zeros(7)})
+    write_arrays(here / "broken" / "champion.npz", {**read_arrays(made / "champion.npz"), "theta": np.zeros(7)})
+    (here / "broken" / "checkpoint.npz").unlink()
     (here / "young" / "champion.npz").unlink()
     before = sorted(here.rglob("*"))
     assert main(argv) == 2

@@ -28,7 +28,7 @@ from turgor.task import Task, make_task
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 dask = pytest.importorskip("dask")
 
-from clusters import RealCluster, wait_until  # noqa: E402
+from clusters import RealCluster, errors_of, wait_until  # noqa: E402
 
 POPULATION = 512
 SPREAD = partial(SepCMAES, population=POPULATION)
@@ -164,16 +164,19 @@ def test_a_campaign_in_many_pieces_is_the_one_in_a_go(client: Any, tmp_path: Pat
 
 
 def assert_same_arrays(a: Path, b: Path) -> None:
+    """But for the seconds in the history, and the checksum over all."""
     with np.load(a) as one, np.load(b) as other:
         assert one.files == other.files
-        assert all(one[name].tobytes() == other[name].tobytes() for name in one.files)
+        names = [name for name in one.files if name.startswith(("strategy_", "champion_"))]
+        assert len(names) > 10
+        assert all(one[name].tobytes() == other[name].tobytes() for name in names)
 
 
 def test_the_command_writes_the_same_tables(cluster: RealCluster, client: Any, tmp_path: Path) -> None:
     tiny = ("--only", "rq2", "--body", "small", "--seeds", "1", "--evaluations", "100", "--no-videos")
     for where, options in (("here", ()), ("there", ("--cluster", cluster.address))):
         done = turgor("reproduce", *tiny, *options, "--out", tmp_path / where)
-        assert (done.returncode, done.stderr) == (0, "")
+        assert (done.returncode, errors_of(done.stderr)) == (0, "")
     tables = [
         {path.name: path.read_bytes() for path in (tmp_path / where / "tables").iterdir()}
         for where in ("here", "there")
@@ -188,7 +191,7 @@ def test_the_command_evolves_on_workers_of_its_own(tmp_path: Path) -> None:
     options = ("--strategy", "sep-cma-es", "--population", 512, "--evaluations", 1024, "--steps", 60, "--no-video")
     for where, more in (("here", ()), ("there", ("--cluster", "local:2"))):
         done = turgor("evolve", *options, *more, "--out", tmp_path / where)
-        assert (done.returncode, done.stderr) == (0, "")
+        assert (done.returncode, errors_of(done.stderr)) == (0, "")
     assert bits_of(Run.open(tmp_path / "here")) == bits_of(Run.open(tmp_path / "there"))
 
 

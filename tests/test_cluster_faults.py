@@ -33,7 +33,7 @@ from turgor.task import Task, make_task
 pytest.importorskip("distributed", reason="needs the extra cluster")
 dask = pytest.importorskip("dask")
 
-from clusters import RealCluster, address_of, once_at_work, wait_until  # noqa: E402
+from clusters import RealCluster, address_of, errors_of, once_at_work, wait_until  # noqa: E402
 
 POPULATION, GENERATIONS = 1024, 3
 SPREAD = partial(SepCMAES, population=POPULATION)
@@ -217,11 +217,11 @@ def test_a_scheduler_that_dies_is_told_and_resume_goes_on(
     cluster.scheduler.kill()
     _, error = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert error.count("\n") == 1
+    assert errors_of(error).count("\n") == 1
     assert re.search(f"scheduler at {cluster.address} is gone .* generations were done; turgor resume {folder}", error)
     assert Run.open(folder).status == "interrupted"
     process = start_turgor("resume", folder, "--no-video")
-    assert (process.communicate(timeout=120)[1], process.returncode) == ("", 0)
+    assert (errors_of(process.communicate(timeout=120)[1]), process.returncode) == ("", 0)
     assert bits_of(Run.open(folder)) == alone
 
 
@@ -342,7 +342,7 @@ def test_ctrl_c_keeps_the_run_and_leaves_no_process(alone: tuple[Any, ...], tmp_
     process = start_turgor("evolve", *options, "--evaluations", evaluations, "--cluster", "local:2", "--out", folder)
     wait_for_rows(folder, process)
     os.killpg(process.pid, signal.SIGINT)
-    _, error = process.communicate(timeout=60)
+    error = errors_of(process.communicate(timeout=60)[1])
     assert (process.returncode, error) == (
         130,
         f"turgor: interrupted; kept in {folder}; turgor resume {folder} goes on\n",

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from sealing import seal
 
 from turgor.evolution.loop import evolve
 from turgor.task import make_task
@@ -37,6 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     evolve(make_task("flat", body="medium", steps=20), 46, 7, out / name, robust_repeats=2, recipe=recipe)
     record = json.loads((out / name / "run.json").read_text())
     (out / name / "run.json").write_text(json.dumps(record | {"note": SCRIPT}))
+    seal(out / name)
     (out / "broken").mkdir()
     (out / "broken" / "run.json").write_text('{"format": 1, ')
     return out

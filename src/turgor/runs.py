@@ -5,22 +5,24 @@ A run is a folder of files that a person can open:
     run.json          the task, every setting, versions, machine, what came out
     history.csv       a row a generation
     champion.npz      the best controller
-    checkpoint.npz    the strategy's whole state: arrays, never objects
+    checkpoint.npz    all that the run's future depends on, its history included: arrays, never objects
+    checkpoint.previous.npz      the one before, while the run is under way
     fitness.png, champion.mp4    drawn by the command line
 
-Every file is written under another name in the same folder, synced and renamed; history.csv grows by a row at a time.
+Every file has a checksum, and is written under another name in the same folder, synced and renamed; history.csv alone
+grows by a row at a time. Whatever happens to it, the checkpoint has what it held.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import hashlib
 import importlib.metadata
 import io
 import os
 import platform
 import sys
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
@@ -28,9 +30,13 @@ import msgspec
 import numpy as np
 
 from turgor.errors import InvalidInput, describe
+from turgor.files import FolderLock, is_left_over, log, read_arrays, write_arrays, write_whole, writing
 from turgor.task import Task, task_from_json, task_to_json
 
-FORMAT = 1
+FORMAT = 2  # 1: without checksums, and without the history in the checkpoint
+FORMATS = (1, 2)
+RECORD, HISTORY, CHAMPION = "run.json", "history.csv", "champion.npz"
+CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint.previous.npz"
 COLUMNS = ("generation", "evaluations", "best", "median", "sigma", "seconds")
 PACKAGES = ("turgor", "numpy", "numba", "cma")
 
@@ -75,10 +81,15 @@ class Champion(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 class Checkpoint(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """A run after one of its generations."""
 
-    generation: int
+    rows: list[Row] = []  # its history
     champion: Champion | None = None
     solver: Champion | None = None
     state: dict[str, Any] | None = None  # of the strategy; None: before its first generation
+    is_previous: bool = False  # the one before the last, which cannot be read
+
+    @property
+    def generation(self) -> int:
+        return len(self.rows)
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
@@ -109,6 +120,8 @@ class Run:
         self.solver: Champion | None = None  # the best of those that solved the task, where it can be solved
         self.seconds: dict[str, float] = {}  # where the time went, `total` included
         self.versions = current_versions()
+        self._checksums = True  # its files have some
+        self._lock: FolderLock | None = None
         self._growing: TextIO | None = None
 
     def __repr__(self) -> str:
@@ -117,40 +130,90 @@ class Run:
 
     @classmethod
     def create(cls, task: Task, settings: Settings, path: str | os.PathLike[str] | None) -> Run:
-        """A new run that records itself in `path`, a new or empty folder; None: in memory alone.
-
-        Raises `InvalidInput` for a folder that holds something.
+        """A new run that records itself in `path`, a new or empty folder, and keeps other processes from it until
+        `close`; None: in memory alone. Raises `InvalidInput` for a folder that holds something, or cannot be written.
         """
         if path is None:
             return cls(task, settings)
         folder = Path(path)
         check_new(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
         run = cls(task, settings, folder)
-        run.write_record()
-        run.rewind(0)
+        run._lock = FolderLock(folder)
+        try:
+            check_new(folder)  # another process may have been faster
+            run.write_record()
+            run.rewind(0)
+        except BaseException:
+            run.close()
+            raise
         return run
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], task: Task | None = None) -> Run:
         """The run in the folder `path`. `task` is needed, and must be the same, where the run's has functions of your
-        own. Raises `InvalidInput` that names the file, what was expected and what was found."""
+        own. A history or champion that is torn is taken from the last checkpoint, and a warning logged. Raises
+        `InvalidInput` that names the file, what was expected and what was found."""
         folder = Path(path)
         record = _read_record(folder)
-        if task is None:
-            task = task_from_json(record.task)
-        elif msgspec.json.decode(task_to_json(task)) != record.task:
-            raise InvalidInput(f"task: expected the one of {folder}", f"another one, {task.name}")
-        run = cls(task, record.settings, folder)
-        run.status, run.note, run.seconds, run.versions = record.status, record.note, record.seconds, record.versions
-        run.rows = _read_history(folder / "history.csv")
-        if (folder / "champion.npz").exists():
-            arrays = read_arrays(folder / "champion.npz")
-            run.champion = _champion(arrays, "", task, folder / "champion.npz")
-            run.solver = _champion(arrays, "solver_", task, folder / "champion.npz")
-            if run.champion is None:
-                raise InvalidInput(f"{folder / 'champion.npz'}: expected the arrays of a champion", "no theta")
+        run = cls(task_from_json(record.task) if task is None else task, record.settings, folder)
+        run._load(record)
         return run
+
+    def claim(self) -> None:
+        """Keeps other processes from writing this run until `close`, and reads what they wrote of it meanwhile.
+
+        Raises `InvalidInput` with the process id of the one that writes it now, or as `open` does.
+        """
+        if self.path is None:
+            return
+        self._lock = FolderLock(self.path)
+        try:
+            self._load(_read_record(self.path))
+        except BaseException:
+            self.close()
+            raise
+
+    def _load(self, record: Record) -> None:
+        assert self.path is not None
+        if msgspec.json.decode(task_to_json(self.task)) != record.task:
+            raise InvalidInput(f"task: expected the one of {self.path}", f"another one, {self.task.name}")
+        self.settings, self.status, self.note = record.settings, record.status, record.note
+        self.seconds, self.versions = record.seconds, record.versions
+        self._checksums = record.format > 1
+        try:
+            self.rows = _read_history(self.path / HISTORY)
+        except InvalidInput as error:
+            checkpoint = self._rescue(error)
+            if checkpoint is None and (self.status != "running" or (self.path / HISTORY).exists()):
+                raise
+            self.rows = [] if checkpoint is None else checkpoint.rows  # none yet: it had only just begun
+        self.champion = self.solver = None
+        path = self.path / CHAMPION
+        if not path.exists():
+            return
+        try:
+            arrays = read_arrays(path, checksum=self._checksums)
+            self.champion, self.solver = (_champion(arrays, prefix, self.task, path) for prefix in ("", "solver_"))
+            if self.champion is None:
+                raise InvalidInput(f"{path}: expected the arrays of a champion", "no theta")
+        except InvalidInput as error:
+            checkpoint = self._rescue(error)
+            if checkpoint is None or checkpoint.champion is None:
+                raise
+            self.champion, self.solver = checkpoint.champion, checkpoint.solver
+
+    def _rescue(self, error: InvalidInput) -> Checkpoint | None:
+        """The checkpoint that has what the file of `error` should have had; None where none can be read."""
+        try:
+            checkpoint = self.read_checkpoint()
+        except InvalidInput:
+            return None
+        if checkpoint.state is None:
+            return None
+        log.warning("note: %s; taken from the checkpoint of generation %d instead", error, checkpoint.generation)
+        return checkpoint
 
     @property
     def history(self) -> dict[str, np.ndarray]:
@@ -179,66 +242,115 @@ class Run:
     def add(self, row: Row) -> None:
         """Adds a generation to the history, in memory and on disk."""
         self.rows.append(row)
-        if self._growing is not None:
-            csv.writer(self._growing, lineterminator="\n").writerow(row)
+        if self._growing is not None and self.path is not None:
+            with writing(self.path / HISTORY):
+                csv.writer(self._growing, lineterminator="\n").writerow(row)
 
     def rewind(self, generation: int) -> None:
         """Drops the history after `generation`, and has history.csv grow from there."""
         self.rows = self.rows[:generation]
         if self.path is None:
             return
-        self.close()
+        self._stop_growing()
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self.rows])
-        write_whole(self.path / "history.csv", text.getvalue().encode())
-        self._growing = open(self.path / "history.csv", "a", buffering=1, encoding="ascii", newline="")  # noqa: SIM115
+        path = self.path / HISTORY
+        write_whole(path, text.getvalue().encode())
+        with writing(path):
+            self._growing = open(path, "a", buffering=1, encoding="ascii", newline="")  # noqa: SIM115
+
+    def _stop_growing(self) -> None:
+        if self._growing is not None:
+            with contextlib.suppress(OSError):  # a row that found no room is tried once more
+                self._growing.close()
+            self._growing = None
 
     def close(self) -> None:
-        """Ends the growing of history.csv."""
-        if self._growing is not None:
-            self._growing.close()
-            self._growing = None
+        """Ends the writing, and lets other processes in."""
+        self._stop_growing()
+        if self._lock is not None and self.path is not None:
+            if self.status == "done":
+                with contextlib.suppress(OSError):
+                    (self.path / PREVIOUS).unlink(missing_ok=True)
+            self._lock.release()
+            self._lock = None
 
     def write_champion(self) -> None:
         """Writes champion.npz."""
         if self.path is not None and self.champion is not None:
-            arrays = {**_arrays(self.champion, ""), **_arrays(self.solver, "solver_")}
-            write_arrays(self.path / "champion.npz", arrays)
+            write_arrays(self.path / CHAMPION, {**_arrays(self.champion, ""), **_arrays(self.solver, "solver_")})
 
     def write_checkpoint(self, state: dict[str, np.ndarray]) -> None:
-        """Writes checkpoint.npz: from what `resume` goes on."""
-        if self.path is not None:
+        """Writes checkpoint.npz: from what `resume` goes on. The one before is kept beside it."""
+        if self.path is None:
+            return
+        arrays = {f"strategy_{name}": value for name, value in state.items()}
+        arrays |= {**_arrays(self.champion, "champion_"), **_arrays(self.solver, "solver_")}
+        arrays["history"] = np.array(self.rows, dtype=np.float64).reshape(-1, len(COLUMNS))
+        with writing(self.path / CHECKPOINT):
             if self._growing is not None:
                 os.fsync(self._growing.fileno())
-            strategy = {f"strategy_{name}": value for name, value in state.items()}
-            champions = {**_arrays(self.champion, "champion_"), **_arrays(self.solver, "solver_")}
-            generation = np.asarray(self.generation)
-            write_arrays(self.path / "checkpoint.npz", {"generation": generation, **champions, **strategy})
+            if (self.path / CHECKPOINT).exists():
+                os.replace(self.path / CHECKPOINT, self.path / PREVIOUS)
+        write_arrays(self.path / CHECKPOINT, arrays)
 
     def read_checkpoint(self) -> Checkpoint:
-        """What checkpoint.npz holds; where there is none, the state before the first generation.
+        """The last checkpoint that is whole; where there is none at all, the state before the first generation.
 
-        Raises `InvalidInput`.
+        Raises `InvalidInput` where there are some and none of them can be read.
         """
-        if self.path is None or not (self.path / "checkpoint.npz").exists():
-            return Checkpoint(generation=0)
-        path = self.path / "checkpoint.npz"
-        arrays = read_arrays(path)
-        generation = arrays.get("generation", np.array(-1))
-        if generation.shape or not 0 <= generation <= self.generation:
-            expected = f"{path}: expected a generation of history.csv, 0 to {self.generation}"
-            raise InvalidInput(expected, describe(generation))
+        if self.path is None:
+            return Checkpoint()
+        problem = None
+        for path in (self.path / CHECKPOINT, self.path / PREVIOUS):
+            try:
+                checkpoint = self._parse_checkpoint(path) if path.exists() else None
+            except InvalidInput as error:
+                problem = problem or error
+                continue
+            if checkpoint is not None and problem is not None:
+                log.warning("note: %s; taken instead: %s, generation %d", problem, path.name, checkpoint.generation)
+            if checkpoint is not None:
+                return checkpoint
+        if problem is not None:
+            raise InvalidInput(f"{problem}; no other is there; without that file the run would be evolved anew")
+        return Checkpoint()
+
+    def _parse_checkpoint(self, path: Path) -> Checkpoint:
+        arrays = read_arrays(path, checksum=self._checksums)
+        if "history" in arrays:
+            rows = _checked_rows(arrays["history"].tolist(), path)
+        else:  # of format 1
+            generation = arrays.get("generation", np.array(-1))
+            if generation.shape or not 0 <= generation <= self.generation:
+                expected = f"{path}: expected a generation of history.csv, 0 to {self.generation}"
+                raise InvalidInput(expected, describe(generation))
+            rows = self.rows[: int(generation)]
         return Checkpoint(
-            generation=int(generation),
+            rows=rows,
             champion=_champion(arrays, "champion_", self.task, path),
             solver=_champion(arrays, "solver_", self.task, path),
             state={name.removeprefix("strategy_"): a for name, a in arrays.items() if name.startswith("strategy_")},
+            is_previous=path.name == PREVIOUS,
         )
 
     def go_back(self, checkpoint: Checkpoint) -> None:
-        """Makes history and champion what they were at `checkpoint`."""
-        self.champion, self.solver = checkpoint.champion, checkpoint.solver
+        """Makes the files what they were at `checkpoint`; run.json last, because it says in which format they are."""
+        self.rows, self.champion, self.solver = checkpoint.rows, checkpoint.champion, checkpoint.solver
         self.rewind(checkpoint.generation)
+        if self.path is None:
+            return
+        if self.champion is None:
+            with writing(self.path / CHAMPION):
+                (self.path / CHAMPION).unlink(missing_ok=True)
+        if checkpoint.is_previous:  # the last one is torn, and must not take this one's place
+            with writing(self.path / CHECKPOINT):
+                (self.path / CHECKPOINT).unlink(missing_ok=True)
+        self.write_champion()
+        if checkpoint.state is not None and not self._checksums:
+            self.write_checkpoint(checkpoint.state)
+        self._checksums = True
+        self.write_record()
 
     def write_record(self) -> None:
         """Writes run.json."""
@@ -259,16 +371,17 @@ class Run:
             machine=machine(),
             task=msgspec.json.decode(task_to_json(self.task)),
         )
-        fields = msgspec.to_builtins(record).items()
-        lines = [f'  "{name}": {msgspec.json.encode(value).decode()}' for name, value in fields]
-        write_whole(self.path / "run.json", ("{\n" + ",\n".join(lines) + "\n}\n").encode())
+        fields = msgspec.to_builtins(record)
+        fields["checksum"] = _checksum(fields)
+        lines = [f'  "{name}": {msgspec.json.encode(value).decode()}' for name, value in fields.items()]
+        write_whole(self.path / RECORD, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
 def check_new(folder: Path) -> None:
     """Raises `InvalidInput` unless `folder` is new or empty."""
     if folder.exists() and not folder.is_dir():
         raise InvalidInput("out: expected a new or empty folder", f"{folder}, which is a file")
-    if folder.is_dir() and any(folder.iterdir()):
+    if folder.is_dir() and not all(is_left_over(path) for path in folder.iterdir()):
         raise InvalidInput("out: expected a new or empty folder", f"{folder}, which is not empty")
 
 
@@ -298,84 +411,68 @@ def machine() -> dict[str, Any]:
     return {"cpu": model, "cores": available_cores(), "platform": platform.platform()}
 
 
-# --- files --------------------------------------------------------------------------------------------------------
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Writes a file that is either the old one or the new one, whatever happens meanwhile."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Writes `arrays` as one .npz file."""
-    assert not any(array.dtype.hasobject for array in arrays.values())
-    data = io.BytesIO()
-    np.savez(data, **arrays)  # ty: ignore[invalid-argument-type]
-    write_whole(path, data.getvalue())
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file, never objects; raises `InvalidInput`."""
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as e:
-        reason = describe(getattr(e, "strerror", None) or e)
-        raise InvalidInput(f"{path}: expected arrays written by turgor", reason) from None
+# --- what is read -----------------------------------------------------------------------------------------------------
 
 
 def _read_record(folder: Path) -> Record:
-    path = folder / "run.json"
+    path = folder / RECORD
     if not folder.is_dir():
         kind = "a file" if folder.exists() else "nothing there"
         raise InvalidInput(f"{folder}: expected the folder of a run", kind)
     try:
         raw = msgspec.json.decode(path.read_bytes())
     except FileNotFoundError:
-        raise InvalidInput(f"{folder}: expected the folder of a run", "no run.json in it") from None
+        raise InvalidInput(f"{folder}: expected the folder of a run", f"no {RECORD} in it") from None
     except OSError as error:
         raise InvalidInput(f"{path}: expected a file that can be read", error.strerror) from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidInput(f"{path}: expected JSON", describe(error)) from None
     found = raw.get("format") if isinstance(raw, dict) else None
-    if found != FORMAT:
-        raise InvalidInput(f"{path}: expected a run of format {FORMAT}", f"format {describe(found)}")
+    if found not in FORMATS:
+        formats = " or ".join(str(known) for known in FORMATS)
+        raise InvalidInput(f"{path}: expected a run of format {formats}", f"format {describe(found)}")
+    if found > 1 and raw.pop("checksum", None) != _checksum(raw):
+        raise InvalidInput(f"{path}: expected the file that turgor wrote", "a changed one: its checksum differs")
     try:
         return msgspec.convert(raw, Record)
     except msgspec.ValidationError as error:
         raise InvalidInput(f"{path}: {error}") from None
 
 
+def _checksum(fields: dict[str, Any]) -> str:
+    """Of what run.json holds, however it is laid out."""
+    return hashlib.sha256(msgspec.json.encode(fields)).hexdigest()
+
+
 def _read_history(path: Path) -> list[Row]:
     """The rows of history.csv; a last line without an end was being written, and is left out."""
     try:
-        lines = path.read_text(encoding="ascii").splitlines(keepends=True)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "other characters"
-        raise InvalidInput(f"{path}: expected a table in ASCII", reason) from None
-    rows = list(csv.reader(line for line in lines if line.endswith("\n")))
-    header = rows[0] if rows else []
+        lines = path.read_bytes().decode("ascii").split("\n")
+        found = list(csv.reader(lines[:-1]))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInput(f"{path}: expected a table in ASCII", getattr(error, "strerror", None) or "else") from None
+    header = found[0] if found else []
     if tuple(header) != COLUMNS:
         raise InvalidInput(f"{path}: expected the columns {', '.join(COLUMNS)}", describe(",".join(header)))
-    history: list[Row] = []
-    for k, row in enumerate(rows[1:], start=1):
+    return _checked_rows(found[1:], path)
+
+
+def _checked_rows(found: list[list[Any]], path: Path) -> list[Row]:
+    """Rows of a history, of text or numbers; raises `InvalidInput` that names `path`."""
+    rows: list[Row] = []
+    for k, row in enumerate(found, start=1):
         try:
             generation, evaluations, *numbers = row
             best, median, sigma, seconds = (float(number) for number in numbers)
-            history.append((int(generation), int(evaluations), best, median, sigma, seconds))
-        except ValueError:
-            raise InvalidInput(f"{path}: expected {len(COLUMNS)} numbers in row {k}", describe(",".join(row))) from None
-        if history[-1][0] != k:
-            raise InvalidInput(f"{path}: expected generation {k} in row {k}", describe(history[-1][0]))
-    return history
+            rows.append((int(generation), int(evaluations), best, median, sigma, seconds))
+        except (ValueError, TypeError, OverflowError):
+            text = describe(",".join(str(value) for value in row) if isinstance(row, list) else row)
+            raise InvalidInput(f"{path}: expected {len(COLUMNS)} numbers in row {k}", text) from None
+        if rows[-1][0] != k:
+            raise InvalidInput(f"{path}: expected generation {k} in row {k}", describe(rows[-1][0]))
+        if rows[-1][1] <= (rows[-2][1] if k > 1 else 0):
+            raise InvalidInput(f"{path}: expected more evaluations in row {k} than before", describe(rows[-1][1]))
+    return rows
 
 
 def _arrays(champion: Champion | None, prefix: str) -> dict[str, np.ndarray]:

@@ -32,8 +32,9 @@ def _evaluate(options: argparse.Namespace) -> None:
     import numpy as np
 
     from turgor.evolution.loop import evaluate
+    from turgor.files import write_whole
     from turgor.recording import tangled
-    from turgor.runs import Run, write_whole
+    from turgor.runs import Run
     from turgor.simulate import Simulator
 
     run = Run.open(options.run)

@@ -27,7 +27,7 @@ def _export(options: argparse.Namespace) -> None:
     path = options.out or Path("replay.html" if options.gallery is None else "gallery.html")
     if not path.parent.is_dir() or path.is_dir():
         raise InvalidInput("--out: expected a file in a folder that exists", str(path))
-    from turgor.runs import write_whole
+    from turgor.files import write_whole
     from turgor.web.export import export_folder, export_runs
 
     if options.gallery is None:

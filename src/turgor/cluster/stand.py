@@ -31,14 +31,13 @@ def own_versions() -> dict[str, str]:
 
 @cache
 def own_kernels() -> dict[str, str]:
-    """Which of their kernels OpenBLAS and NumPy chose for this processor: what a whole run's bits depend on, because its
-    strategy does. The engine's own bits do not."""
+    """Which kernels OpenBLAS and NumPy chose for this processor: the bits of a whole run depend on them, because its
+    strategy's do; those of a simulation do not."""
     from threadpoolctl import threadpool_info
 
     importlib.import_module("scipy.linalg")  # has a BLAS of its own, which is known once it is loaded
-    blas = {
-        found.get("architecture", found["internal_api"]) for found in threadpool_info() if found["user_api"] == "blas"
-    }
+    libraries = [library for library in threadpool_info() if library["user_api"] == "blas"]
+    blas = {library.get("architecture", library["internal_api"]) for library in libraries}
     loops: set[str] = set()
     with contextlib.suppress(ImportError):  # from NumPy 2.1 on
         introspect = importlib.import_module("numpy.lib.introspect")
@@ -52,7 +51,7 @@ def _joined(names: set[str]) -> str:
 
 
 def check_versions(worker: str, found: Mapping[str, str | None], expected: Mapping[str, str]) -> None:
-    """Raises `InvalidInput` that names the address of a `worker` that has other versions, or kernels, and both of them."""
+    """Raises `InvalidInput` that names the address of a `worker` that has other versions or kernels, and both."""
     for name, version in expected.items():
         if name in found and found[name] != version:
             what = "turgor's sources" if name == "sources" else name

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -19,7 +20,8 @@ from numpy.typing import ArrayLike
 from turgor.errors import InvalidInput, WorkLost, describe
 from turgor.evolution import STRATEGIES
 from turgor.evolution.strategy import Degenerate, Strategy, built_in
-from turgor.runs import Champion, Checkpoint, Run, Settings, current_versions
+from turgor.files import NotWritten
+from turgor.runs import RECORD, Champion, Checkpoint, Run, Settings, current_versions
 from turgor.simulate import Rollout, Simulator, perturbed
 from turgor.task import Task
 
@@ -73,8 +75,10 @@ def evolve(
     """
     started = time.perf_counter()
     simulator = _simulator(task, threads, executor)
-    run, optimizer = begin(task, evaluations, seed, out, strategy, simulator.threads, robust_repeats, recipe)
-    return _carry_on(run, simulator, optimizer, progress, _Clock(run.seconds, started))
+    with _told_what_is_kept(out):
+        run, optimizer = begin(task, evaluations, seed, out, strategy, simulator.threads, robust_repeats, recipe)
+        with contextlib.closing(run):
+            return _carry_on(run, simulator, optimizer, progress, _Clock(run.seconds, started))
 
 
 def begin(
@@ -124,30 +128,31 @@ def resume(
     It goes on from its last checkpoint; what came after is evolved again. `strategy` is what `evolve` was given; None
     for a built-in one, which run.json names. `executor` is as in `evolve`, whatever the run was started with.
 
-    Raises `InvalidInput` for a run that has no evaluations left, whose strategy is another one or not known, or whose
-    checkpoint cannot be read.
+    Raises `InvalidInput` for a run that another process writes, that has no evaluations left, whose strategy is another
+    one or not known, or of which no checkpoint can be read.
     """
     started = time.perf_counter()
-    settings = run.settings
-    budget = settings.evaluations if evaluations is None else evaluations
-    if not isinstance(budget, int) or budget < 1:
-        raise InvalidInput("evaluations: expected a whole number, at least 1", describe(budget))
-    if run.status == "done" and run.evaluations >= budget:
-        raise InvalidInput(f"evaluations: expected more than the {run.evaluations} that are done", str(budget))
-    if run.status == "done" and run.note:
-        raise InvalidInput(f"resume: expected a run that can go on; {run.note}")
-    simulator = _simulator(run.task, threads, executor)
-    checkpoint = run.read_checkpoint()
-    optimizer = _restored(run, checkpoint, strategy)
-    reopen(run, checkpoint, msgspec.structs.replace(settings, evaluations=budget, threads=simulator.threads))
-    return _carry_on(run, simulator, optimizer, progress, _Clock(run.seconds, started))
+    run.claim()
+    with _told_what_is_kept(run.path), contextlib.closing(run):
+        settings = run.settings
+        budget = settings.evaluations if evaluations is None else evaluations
+        if not isinstance(budget, int) or budget < 1:
+            raise InvalidInput("evaluations: expected a whole number, at least 1", describe(budget))
+        if run.status == "done" and run.evaluations >= budget:
+            raise InvalidInput(f"evaluations: expected more than the {run.evaluations} that are done", str(budget))
+        if run.status == "done" and run.note:
+            raise InvalidInput(f"resume: expected a run that can go on; {run.note}")
+        simulator = _simulator(run.task, threads, executor)
+        checkpoint = run.read_checkpoint()
+        optimizer = _restored(run, checkpoint, strategy)
+        reopen(run, checkpoint, msgspec.structs.replace(settings, evaluations=budget, threads=simulator.threads))
+        return _carry_on(run, simulator, optimizer, progress, _Clock(run.seconds, started))
 
 
 def reopen(run: Run, checkpoint: Checkpoint, settings: Settings) -> None:
     """Has `run` go back to `checkpoint`, to be evolved by `settings` from there."""
     run.settings = settings
     run.status, run.note, run.versions = "running", None, current_versions()
-    run.write_record()
     run.go_back(checkpoint)
 
 
@@ -227,6 +232,9 @@ def _carry_on(
             run.status = "interrupted"
             kept = "the run was in memory alone" if run.path is None else f"turgor resume {run.path} goes on"
             raise InvalidInput(f"{lost}; {run.generation} generations were done; {kept}") from None
+        except NotWritten as error:
+            run.status, run.note = "interrupted", str(error)
+            raise
         except Exception as error:
             run.status, run.note = "failed", describe(error)
             raise
@@ -237,10 +245,20 @@ def _carry_on(
             # a strategy that stopped, or was stopped amid its work, has no state to go on from
             whole = run.status != "failed" and run.note is None and not interrupt.forced
             save(run, optimizer.state() if whole else None, clock.seconds())
-            run.close()
     if interrupt.wanted:
         raise KeyboardInterrupt
     return run
+
+
+@contextlib.contextmanager
+def _told_what_is_kept(folder: str | os.PathLike[str] | None) -> Generator[None]:
+    """Adds to a full disk's error what became of the work."""
+    try:
+        yield
+    except NotWritten as error:
+        if folder is None or not (Path(folder) / RECORD).exists():
+            raise
+        raise NotWritten(f"{error}; all written before is whole, and turgor resume {folder} goes on from it") from None
 
 
 def _generations(

@@ -23,7 +23,8 @@ from turgor.evolution.loop import Progress, begin, evolve_a_while, reopen, save
 from turgor.evolution.strategy import hold_blas
 from turgor.experiments.measure import Measured, measure
 from turgor.experiments.plan import Entry
-from turgor.runs import Checkpoint, Row, Run, Settings
+from turgor.files import NotWritten
+from turgor.runs import Checkpoint, Run, Settings
 
 REPORT_INTERVAL = 0.5  # [s], between two reports of a run
 
@@ -33,7 +34,6 @@ class Stand(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
     settings: Settings
     done: bool
-    rows: list[Row]
     seconds: dict[str, float]
     checkpoint: Checkpoint
 
@@ -43,7 +43,6 @@ class Piece(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
     done: bool
     note: str | None
-    rows: list[Row]  # new ones
     seconds: dict[str, float]
     checkpoint: Checkpoint
     measured: Measured | None  # of a run that is done, and of a passive body
@@ -105,13 +104,10 @@ def work(topic: str, entry: Entry, stand: Stand | None, seconds: float) -> Piece
     """The next `seconds` of an entry that stands at `stand`: on a worker. None: a passive body."""
     with _one_at_a_time:
         if stand is None:
-            checkpoint = Checkpoint(generation=0)
-            return Piece(
-                done=True, note=None, rows=[], seconds={}, checkpoint=checkpoint, measured=measure(entry, None)
-            )
+            return Piece(done=True, note=None, seconds={}, checkpoint=Checkpoint(), measured=measure(entry, None))
         run = Run(entry.make_task(), stand.settings)
-        run.rows, run.seconds = list(stand.rows), dict(stand.seconds)
-        run.champion, run.solver = stand.checkpoint.champion, stand.checkpoint.solver
+        run.seconds = dict(stand.seconds)
+        run.go_back(stand.checkpoint)
         state = None
         if not stand.done:
             hold_blas()
@@ -121,9 +117,8 @@ def work(topic: str, entry: Entry, stand: Stand | None, seconds: float) -> Piece
         return Piece(
             done=done,
             note=run.note,
-            rows=run.rows[len(stand.rows) :],
             seconds=run.seconds,
-            checkpoint=Checkpoint(generation=run.generation, champion=run.champion, solver=run.solver, state=state),
+            checkpoint=Checkpoint(rows=run.rows, champion=run.champion, solver=run.solver, state=state),
             measured=measure(entry, run) if done else None,
         )
 
@@ -166,10 +161,11 @@ def _taken_up(folder: Path, entry: Entry, run: Run | None) -> tuple[Run | None, 
         how: dict[str, Any] = {"strategy": partial(CMAES, population=entry.population), "threads": 1}
         out = folder / entry.name
         run, _ = begin(entry.make_task(), entry.evaluations, entry.seed, out, recipe=entry.recipe, **how)
-        return run, _stand_of(run, Checkpoint(generation=0))
+        return run, _stand_of(run, Checkpoint())
     if run.status == "done":
-        checkpoint = Checkpoint(generation=run.generation, champion=run.champion, solver=run.solver)
+        checkpoint = Checkpoint(rows=run.rows, champion=run.champion, solver=run.solver)
     else:
+        run.claim()
         checkpoint = run.read_checkpoint()
         reopen(run, checkpoint, run.settings)
     return run, _stand_of(run, checkpoint)
@@ -180,7 +176,6 @@ def _stand_of(run: Run | None, checkpoint: Checkpoint) -> Stand:
     return Stand(
         settings=run.settings,
         done=run.status == "done",
-        rows=run.rows,
         seconds=run.seconds,
         checkpoint=checkpoint,
     )
@@ -190,7 +185,7 @@ def _keep(run: Run, piece: Piece) -> None:
     """Writes down what came of `run`."""
     if run.status == "done":
         return
-    for row in piece.rows:
+    for row in piece.checkpoint.rows[run.generation :]:
         run.add(row)
     run.champion, run.solver = piece.checkpoint.champion, piece.checkpoint.solver
     run.status, run.note = "done" if piece.done else "running", piece.note
@@ -203,5 +198,5 @@ def _leave(run: Run | None) -> None:
     """Writes down that `run` was left before its end."""
     if run is not None and run.status != "done":
         run.status = "interrupted"
-        run.write_record()
-        run.close()
+        with contextlib.closing(run), contextlib.suppress(NotWritten):
+            run.write_record()

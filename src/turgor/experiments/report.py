@@ -38,7 +38,7 @@ from turgor.experiments.page import (
 from turgor.experiments.plan import QUESTIONS
 from turgor.experiments.rows import KINDS, Champion, Comparison, Tables
 from turgor.experiments.statistics import magnitude, smallest_p
-from turgor.runs import write_whole
+from turgor.files import write_whole
 
 if TYPE_CHECKING:
     from turgor.experiments.sheets import Figure

@@ -30,9 +30,10 @@ from turgor.experiments.measure import STARTS, Measured
 from turgor.experiments.plan import BODIES, make_plan
 from turgor.experiments.report import Film, Method, write_report
 from turgor.experiments.rows import Tables, write_tables
+from turgor.files import write_whole
 from turgor.physics.batch import load_kernel
 from turgor.recording import Recording
-from turgor.runs import current_versions, machine, write_whole
+from turgor.runs import current_versions, machine
 from turgor.simulate import Simulator, available_cores
 from turgor.view.video import write_video
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import msgspec
 
 from turgor.errors import InvalidInput
-from turgor.runs import write_whole
+from turgor.files import write_whole
 
 
 class Inflated(msgspec.Struct, frozen=True, kw_only=True):

@@ -16,7 +16,7 @@ import msgspec
 
 from turgor.experiments.plan import BODIES
 from turgor.experiments.rows import Champion
-from turgor.runs import write_whole
+from turgor.files import write_whole
 
 WIDTH = 7.0  # [in]
 FORMATS = ("svg", "pdf", "png")

@@ -16,9 +16,18 @@ import numpy as np
 
 from turgor.errors import InvalidInput, describe
 from turgor.experiments.rows import Champion, read_rows
-from turgor.runs import COLUMNS, Run
+from turgor.runs import CHECKPOINT, COLUMNS, PREVIOUS, Run
 from turgor.web.guard import Refused, check_file
-from turgor.web.watch import HISTORY_BYTES, RECORD_BYTES, Event, Record, RunSummary, RunWatch, check_arrays
+from turgor.web.watch import (
+    CHAMPION_BYTES,
+    CHECKPOINT_BYTES,
+    HISTORY_BYTES,
+    RECORD_BYTES,
+    Event,
+    Record,
+    RunSummary,
+    RunWatch,
+)
 
 MARK = "campaign.json"  # as in experiments/reproduce.py, which would load the figures too
 DEPTH = 4  # folders below the served one in which runs are looked for
@@ -183,7 +192,9 @@ class Library:
         try:
             check_file(folder / "run.json", RECORD_BYTES)
             check_file(folder / "history.csv", HISTORY_BYTES)
-            check_arrays(folder / "champion.npz")
+            check_file(folder / "champion.npz", CHAMPION_BYTES)
+            for name in (CHECKPOINT, PREVIOUS):  # read where another file is torn
+                check_file(folder / name, CHECKPOINT_BYTES)
         except InvalidInput as error:
             raise Refused(413, str(error)) from None
         return folder

@@ -6,22 +6,20 @@ because it may be anything.
 
 from __future__ import annotations
 
-import math
 import os
 import time
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 
 from turgor.body import SIZES
 from turgor.errors import InvalidInput, describe
-from turgor.runs import COLUMNS, FORMAT, Row, Settings, Status
+from turgor.files import read_arrays
+from turgor.runs import COLUMNS, FORMATS, Row, Settings, Status
 from turgor.web.guard import check_file
 
-RECORD_BYTES, HISTORY_BYTES, CHAMPION_BYTES = 5_000_000, 50_000_000, 50_000_000
+RECORD_BYTES, HISTORY_BYTES, CHAMPION_BYTES, CHECKPOINT_BYTES = 5_000_000, 50_000_000, 50_000_000, 500_000_000
 TAIL_BYTES, NEWS_BYTES = 4_096, 200_000  # of a history: read for its last row, and of its new rows at most
 QUIET = 180.0  # [s] without a new generation after which a run that does not say it ended is taken for interrupted
 LARGEST_INTEGER = 2**53  # that a page can hold
@@ -105,7 +103,6 @@ class RunWatch:
         if marks[1] != self._marks[1]:
             rows = self._read_history(files[1], self._marks[1] and marks[1] and marks[1][2] == self._marks[1][2])
         if marks[2] != self._marks[2]:
-            check_arrays(self._folder / "champion.npz")
             self._kept, solved = _read_champion(self._folder / "champion.npz")
             self._solved = None if self._record.task.end is None else solved
         known = self.summary is not None
@@ -222,8 +219,9 @@ def _read_record(path: Path) -> Record:
         raise InvalidInput(f"run.json: {error}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidInput("run.json: expected JSON", describe(error)) from None
-    if record.format != FORMAT:
-        raise InvalidInput(f"run.json: expected a run of format {FORMAT}", f"format {describe(record.format)}")
+    if record.format not in FORMATS:
+        formats = " or ".join(str(known) for known in FORMATS)
+        raise InvalidInput(f"run.json: expected a run of format {formats}", f"format {describe(record.format)}")
     if max(abs(record.settings.seed), abs(record.settings.evaluations)) > LARGEST_INTEGER:
         raise InvalidInput("run.json: expected a seed and evaluations up to 2^53")
     return record
@@ -242,40 +240,12 @@ def _parse(line: str) -> Row:
     raise InvalidInput("history.csv: expected rows of six numbers", describe(line))
 
 
-def check_arrays(path: Path) -> None:
-    """Raises `InvalidInput` for a .npz file that is no plain one, or whose arrays would take too much memory."""
-    if check_file(path, CHAMPION_BYTES) is None:
-        return
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            declared = sum(member.file_size for member in members)
-            for member in members if declared <= CHAMPION_BYTES else []:
-                declared = max(declared, _array_bytes(archive, member))
-    except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile) as error:
-        raise InvalidInput(f"{path.name}: expected arrays written by turgor", describe(error)) from None
-    if declared > CHAMPION_BYTES:
-        most = f"{CHAMPION_BYTES / 1e6:.0f} MB"
-        raise InvalidInput(f"{path.name}: expected at most {most} of arrays", f"{declared / 1e6:.0f} MB")
-
-
-def _array_bytes(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
-    """The memory that an array of a .npz file would take, by its header."""
-    with archive.open(member) as file:
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        version = np.lib.format.read_magic(file)
-        if version not in read:
-            raise ValueError(f"an array of format {version}")
-        shape, _, dtype = read[version](file)
-    return math.prod(int(n) for n in shape) * dtype.itemsize
-
-
 def _read_champion(path: Path) -> tuple[float | None, bool | None]:
     """The champion's fitness and whether it solved its task; None where the file does not tell."""
     if not path.exists():
         return None, None
-    with np.load(path, allow_pickle=False) as arrays:
-        found = {name: arrays[name].item() for name in ("fitness", "solved") if name in arrays.files}
+    arrays = read_arrays(path, checksum=False)
+    found = {name: arrays[name].item() for name in ("fitness", "solved") if name in arrays}
     fitness, solved = found.get("fitness"), found.get("solved")
     return None if fitness is None else float(fitness), None if solved is None else bool(solved)
 

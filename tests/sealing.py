@@ -1,0 +1,16 @@
+"""Run folders changed on purpose."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import msgspec
+
+
+def seal(folder: Path) -> None:
+    """Gives run.json the checksum of what it says, so that what is behind that check is reached."""
+    fields = msgspec.json.decode((folder / "run.json").read_bytes())
+    fields.pop("checksum", None)
+    fields["checksum"] = hashlib.sha256(msgspec.json.encode(fields)).hexdigest()
+    (folder / "run.json").write_bytes(msgspec.json.encode(fields))
