@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import re
+import runpy
+import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,11 +16,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+from turgor import cli
+from turgor.cli.command import Parser
 from turgor.cluster import connect as connections
 from turgor.cluster.connect import connect
+from turgor.cluster.crew import Patience
 from turgor.cluster.shards import LARGEST, SMALLEST, ShardedSimulator, cut_into_shards
 from turgor.errors import InvalidInput
 from turgor.evolution.loop import evolve, resume
@@ -247,3 +257,57 @@ def test_dask_is_not_imported_unless_it_is_asked_for() -> None:
     modules = "turgor.cli, turgor.experiments.reproduce, turgor.cluster.connect, turgor.cluster.shards"
     code = f"import sys, {modules}; sys.exit('dask' in sys.modules or 'distributed' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+# --- the page -----------------------------------------------------------------------------------------------------
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+COMMANDS = [
+    shlex.split(line)
+    for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
+    for line in block.splitlines()
+    if line.startswith(("turgor ", "dask "))
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda words: "-".join(words[:2]))
+def test_the_commands_of_the_page_are_understood(command: list[str]) -> None:
+    program, name, *options = command
+    if program == "turgor":
+        parser = Parser(name, "", "")
+        cli.COMMANDS[name].options(parser)
+        assert parser.parse(options).cluster.startswith(("tcp://", "local:"))
+    else:
+        dask_command = importlib.import_module(f"distributed.cli.dask_{name}").main
+        assert dask_command.make_context(name, options).params
+
+
+def test_the_page_tells_the_time_outs_as_they_are() -> None:
+    for name, value in msgspec.structs.asdict(Patience()).items():
+        setting = name.replace("_", "-")
+        assert re.search(rf"\| `{setting}` \| `DASK_TURGOR__{name.upper()}` \| {value:.0f}\b", PAGE)
+
+
+def test_a_time_out_is_taken_from_the_environment() -> None:
+    code = "from turgor.cluster.crew import patience; print(patience().answer_timeout)"
+    environment = {**os.environ, "DASK_TURGOR__ANSWER_TIMEOUT": "2 minutes"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=60)
+    assert (done.stdout, done.stderr) == ("120.0\n", "")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_the_job_files_for_slurm_are_shell() -> None:
+    files = [(ROOT / "examples" / "cluster" / "turgor.sbatch").read_text(encoding="utf-8")]
+    if importlib.util.find_spec("dask_jobqueue"):
+        example = runpy.run_path(str(ROOT / "examples" / "cluster" / "slurm.py"))
+        local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+        with example["make_cluster"](scheduler_options=local) as cluster:
+            files.append(cluster.job_script())
+        assert "--nthreads 1 " in files[1]
+        assert "--nworkers 16 " in files[1]
+        assert "OPENBLAS_NUM_THREADS=1" in files[1]
+    for text in files:
+        assert text.count("\n#SBATCH") > 3
+        checked = subprocess.run(["bash", "-n"], input=text, capture_output=True, text=True, timeout=60)
+        assert (checked.returncode, checked.stderr) == (0, "")
