@@ -293,7 +293,7 @@ def test_a_time_out_is_taken_from_the_environment() -> None:
     code = "from turgor.cluster.crew import patience; print(patience().answer_timeout)"
     environment = {**os.environ, "DASK_TURGOR__ANSWER_TIMEOUT": "2 minutes"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=60)
-    assert (done.stdout, done.stderr) == ("120.0\n", "")
+    assert (float(done.stdout), done.stderr) == (120.0, "")
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
