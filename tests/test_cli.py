@@ -166,7 +166,7 @@ def test_help_imports_nothing_heavy() -> None:
         (["evaluate", "full/file"], "full/file: expected the folder of a run; got a file"),
         (["evaluate", "full", "--repeats", "0"], "--repeats: expected a whole number, at least 1; got 0"),
         (["resume", "full"], "full: expected the folder of a run; got no run.json in it"),
-        (["resume", "made"], "evaluations: expected more than the 42 that are done; got 42"),
+        (["resume", "made", "--evaluations", "42"], "evaluations: expected more than the 42 that are done; got 42"),
         (["video", "full"], "full: expected the folder of a run; got no run.json in it"),
         (["video", "made", "--size", "big"], "--size: expected WIDTHxHEIGHT in pixels, as in 1280x720; got 'big'"),
         (["video", "made", "--size", "7x7"], "size: expected"),

@@ -163,10 +163,12 @@ def pickled(folder: Path) -> None:
         (edit("run.json", '"seed":3', '"seed":"x"'), r"run.json: Expected `int`, got `str` - at `\$.settings.seed`"),
         (edit("run.json", '"condition":"pressure"', '"condition":"x"'), "task: Invalid enum value 'x'"),
         (edit("run.json", '"steps":40', '"steps":0'), "steps: expected a whole number, 1 to 10000000; got 0"),
-        (lambda f: (f / "history.csv").unlink(), "history.csv: expected a table"),
+        (without("history.csv"), "history.csv: expected a table in ASCII; got No such file"),
         (edit("history.csv", "median", "mean"), "history.csv: expected the columns generation, "),
         (edit("history.csv", "\n2,42,", "\n2,many,"), "history.csv: expected 6 numbers in row 2; got 2,many"),
         (edit("history.csv", "\n2,42,", "\n7,42,"), "history.csv: expected generation 2 in row 2; got 7"),
+        (edit("history.csv", "\n2,42,", "\n2,43,"), "history.csv: expected the table that turgor wrote; got a changed"),
+        (cut("history.csv", 0.9), "history.csv: expected the table that turgor wrote; got a changed one"),
         (lambda f: (f / "champion.npz").write_bytes(b"PK no"), "champion.npz: expected arrays written by turgor"),
         (lambda f: (f / "champion.npz").write_bytes(b""), "champion.npz: expected arrays written by turgor"),
         (pickled, "champion.npz: expected arrays written by turgor"),
@@ -361,7 +363,7 @@ def test_what_another_process_wrote_meanwhile_is_not_undone(folder: Path) -> Non
 
 def test_folder_of_a_process_that_was_killed_before_it_wrote_is_taken(task: Task, tmp_path: Path) -> None:
     (tmp_path / ".lock").write_text(" 1 on elsewhere")
-    (tmp_path / ".run.json.1.partial").write_text("{")
+    (tmp_path / ".run.1.partial.json").write_text("{")
     evolve(task, 21, out=tmp_path, robust_repeats=1)
     files = ["champion.npz", "checkpoint.npz", "history.csv", "run.json"]
     assert sorted(f.name for f in tmp_path.iterdir()) == files

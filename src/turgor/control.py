@@ -185,7 +185,7 @@ def pack(
 
 def turn_per_step(u: np.ndarray, dt: float) -> np.ndarray:
     """Part of a turn [1], in [0, 1), by which sinusoids of 2^u Hz advance in `dt` [s], in whole 2^-23 of a turn."""
-    turn = np.exp2(np.clip(u, -LARGEST_EXPONENT, LARGEST_EXPONENT)) * dt
+    turn = np.exp2(np.clip(u.astype(np.float64), -LARGEST_EXPONENT, LARGEST_EXPONENT)) * dt
     return np.round(turn * CLOCK) % CLOCK / CLOCK
 
 
@@ -197,21 +197,25 @@ def rows(theta: np.ndarray, body: Body, condition: Condition) -> tuple[np.ndarra
 
 
 def check_theta(theta: ArrayLike, body: Body, condition: Condition, controller: Controller = LINEAR) -> np.ndarray:
-    """`theta` as float64 [agent, parameter]; raises `InvalidInput` for another shape, NaN or infinity."""
+    """`theta` as float64 [agent, parameter], or as it is if it is an array of float32: theta may be large, and the
+    kernel reads float32. Raises `InvalidInput` for another shape, NaN or infinity."""
     count = parameter_count(body, condition, controller)
+    dtype = np.float32 if getattr(theta, "dtype", None) == np.float32 else np.float64
     try:
-        array = np.asarray(theta, dtype=np.float64)
+        array = np.asarray(theta, dtype=dtype)
     except (TypeError, ValueError):
         raise InvalidInput(f"theta: expected numbers of shape [agent, {count}]", describe(theta)) from None
     if array.ndim != 2 or array.shape[1] != count:
         hint = " (for one agent: theta[None])" if array.shape == (count,) else ""
         raise InvalidInput(f"theta: expected shape [agent, {count}]{hint}", f"shape {list(array.shape)}")
-    if not np.isfinite(array).all():
+    # NaN and infinity show in the extremes, without a temporary array
+    with np.errstate(invalid="ignore"):
+        largest = float(np.maximum(array.max(initial=0.0), -array.min(initial=0.0)))
+    if not np.isfinite(largest):
         agent, parameter = np.argwhere(~np.isfinite(array))[0]
         raise InvalidInput(
             "theta: expected finite numbers", f"{array[agent, parameter]} at agent {agent}, parameter {parameter}"
         )
-    largest = max(array.max(initial=0.0), -array.min(initial=0.0))  # no temporary array: theta may be large
     if largest > 1e15:
         raise InvalidInput("theta: expected numbers within 1e15", describe(largest))
     return array

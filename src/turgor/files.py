@@ -10,6 +10,7 @@ import logging
 import math
 import os
 import socket
+import time
 import zipfile
 from collections.abc import Generator, Mapping
 from pathlib import Path
@@ -21,6 +22,8 @@ from turgor.errors import InvalidInput, describe
 
 LOCK = ".lock"
 PARTIALS = ".*.partial*"  # files that were being written
+OWN = (".json", ".csv", ".npz")  # what is written under the lock alone
+FORGOTTEN = 3600.0  # [s] after which nobody draws a picture any more
 DIGEST = "sha256"  # the array that holds the checksum of the others
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
@@ -40,27 +43,31 @@ def writing(path: Path) -> Generator[None]:
         raise NotWritten(f"{path}: expected to be able to write it", error.strerror or describe(error)) from None
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Writes a file that is either the old one or the new one, whatever happens meanwhile. Raises `NotWritten`."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+@contextlib.contextmanager
+def whole(path: Path) -> Generator[Path]:
+    """Where to write a file that is to be the old one or the new one, whatever happens meanwhile: it is synced and gets
+    its name at the end of the block, and is gone if that raises. Raises `NotWritten`."""
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     with writing(path):
         try:
-            with open(partial, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
+            yield partial
+            _sync(partial, os.O_RDWR)
             os.replace(partial, path)
-            _sync_folder(path.parent)
+            if os.name == "posix":  # so that the name survives a power cut; elsewhere the system sees to it
+                _sync(path.parent, os.O_RDONLY)
         finally:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
 
 
-def _sync_folder(folder: Path) -> None:
-    """Has the new name survive a power cut; where folders cannot be opened (Windows), the system sees to it."""
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
+def write_whole(path: Path, data: bytes) -> None:
+    """Writes `data` as `whole` does. Raises `NotWritten`."""
+    with whole(path) as partial:
+        partial.write_bytes(data)
+
+
+def _sync(path: Path, mode: int) -> None:
+    handle = os.open(path, mode)
     try:
         os.fsync(handle)
     finally:
@@ -153,8 +160,9 @@ class FolderLock:
         with writing(self._path):
             while self._handle is None:
                 self._handle = self._open()
-            for partial in folder.glob(PARTIALS):  # of a process that was killed
-                partial.unlink(missing_ok=True)
+            for partial in folder.glob(PARTIALS):  # of a process that was killed; a picture may be drawn without lock
+                if partial.suffix in OWN or time.time() - partial.stat().st_mtime > FORGOTTEN:
+                    partial.unlink(missing_ok=True)
 
     def _open(self) -> int | None:
         """A handle that holds the lock; None where the file was removed meanwhile."""

@@ -103,6 +103,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
     machine: dict[str, Any]
     task: dict[str, Any]
+    history: str | None = None  # checksum of history.csv; None: it grows, or the format is 1
     result: dict[str, Any] = {}  # for readers; champion.npz and history.csv are what counts
 
 
@@ -183,10 +184,10 @@ class Run:
         self.seconds, self.versions = record.seconds, record.versions
         self._checksums = record.format > 1
         try:
-            self.rows = _read_history(self.path / HISTORY)
+            self.rows = _read_history(self.path / HISTORY, record.history)
         except InvalidInput as error:
             checkpoint = self._rescue(error)
-            if checkpoint is None and (self.status != "running" or (self.path / HISTORY).exists()):
+            if checkpoint is None and self.status != "running":
                 raise
             self.rows = [] if checkpoint is None else checkpoint.rows  # none yet: it had only just begun
         self.champion = self.solver = None
@@ -252,12 +253,15 @@ class Run:
         if self.path is None:
             return
         self._stop_growing()
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self.rows])
         path = self.path / HISTORY
-        write_whole(path, text.getvalue().encode())
+        write_whole(path, self._history_text())
         with writing(path):
             self._growing = open(path, "a", buffering=1, encoding="ascii", newline="")  # noqa: SIM115
+
+    def _history_text(self) -> bytes:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self.rows])
+        return text.getvalue().encode()
 
     def _stop_growing(self) -> None:
         if self._growing is not None:
@@ -360,8 +364,10 @@ class Run:
         result: dict[str, Any] = {"generations": self.generation, "evaluations": self.evaluations}
         if champion is not None:
             result |= {"fitness": champion.fitness, "robust_fitness": champion.robust_fitness}
+        grown = self.status != "running"
         record = Record(
             format=FORMAT,
+            history=hashlib.sha256(self._history_text()).hexdigest() if grown else None,
             status=self.status,
             note=self.note,
             settings=self.settings,
@@ -444,17 +450,21 @@ def _checksum(fields: dict[str, Any]) -> str:
     return hashlib.sha256(msgspec.json.encode(fields)).hexdigest()
 
 
-def _read_history(path: Path) -> list[Row]:
+def _read_history(path: Path, checksum: str | None) -> list[Row]:
     """The rows of history.csv; a last line without an end was being written, and is left out."""
     try:
-        lines = path.read_bytes().decode("ascii").split("\n")
+        data = path.read_bytes()
+        lines = data.decode("ascii").split("\n")
         found = list(csv.reader(lines[:-1]))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InvalidInput(f"{path}: expected a table in ASCII", getattr(error, "strerror", None) or "else") from None
     header = found[0] if found else []
     if tuple(header) != COLUMNS:
         raise InvalidInput(f"{path}: expected the columns {', '.join(COLUMNS)}", describe(",".join(header)))
-    return _checked_rows(found[1:], path)
+    rows = _checked_rows(found[1:], path)
+    if checksum is not None and hashlib.sha256(data).hexdigest() != checksum:
+        raise InvalidInput(f"{path}: expected the table that turgor wrote", "a changed one: its checksum differs")
+    return rows
 
 
 def _checked_rows(found: list[list[Any]], path: Path) -> list[Row]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
@@ -24,6 +24,7 @@ from turgor.scene import LARGEST_COORDINATE, Scene
 from turgor.task import Physics, Task, given_rows, start_position
 
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
+AGENTS_AT_ONCE = 4096  # whose final positions are looked at in float64
 
 
 class Rollout(msgspec.Struct, frozen=True, eq=False, kw_only=True):
@@ -86,7 +87,8 @@ class Simulator:
 
     def rollout(self, theta: ArrayLike, position: ArrayLike | None = None) -> Rollout:
         """A `Rollout` of every row of `theta` [agent, parameter] from the task's start, or from `position` [m],
-        shape [agent, mass, 2]. Raises `InvalidInput` for another shape or numbers that are not finite."""
+        shape [agent, mass, 2]. Theta of float32 takes half the memory and gives the same bits as the same numbers in
+        float64. Raises `InvalidInput` for another shape or numbers that are not finite."""
         theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
         starts = self._starts(len(theta), position)
         final = np.empty(starts.shape, dtype=np.float32)
@@ -100,6 +102,16 @@ class Simulator:
 
         self._spread(run, _parts(len(theta), self.threads))
         return self._judge(starts, final, steps, solved)
+
+    def rollouts(self, chunks: Iterable[ArrayLike]) -> Iterator[Rollout]:
+        """A `Rollout` of each of `chunks`, theta [agent, parameter] of any length, with the bits that one `rollout` of
+        all would have. The next chunk is asked for when its rollout is, and none is kept: a generator of chunks
+        streams any number of agents in the memory of one chunk. Raises `InvalidInput`."""
+        if isinstance(chunks, np.ndarray) and chunks.ndim == 2:
+            raise InvalidInput("chunks: expected several theta, as [theta] is", f"one, shape {list(chunks.shape)}")
+        if not isinstance(chunks, Iterable):
+            raise InvalidInput("chunks: expected theta after theta", describe(chunks))
+        return map(self.rollout, chunks)
 
     def record(self, theta: ArrayLike, position: ArrayLike | None = None) -> Recording:
         """The `Recording` of one controller, `theta` [parameter], from the task's start or from `position`
@@ -292,8 +304,7 @@ class Simulator:
     def _judge(self, starts: np.ndarray, final: np.ndarray, steps: np.ndarray, solved: np.ndarray) -> Rollout:
         task = self.task
         share = task.body.mass / task.body.mass.sum()
-        start = np.einsum("amd,m->ad", starts.astype(np.float64), share)
-        com = np.einsum("amd,m->ad", final.astype(np.float64), share)
+        start, com = (_in_pieces(lambda p: np.einsum("amd,m->ad", p, share), where) for where in (starts, final))
         travel = com[:, 0] - start[:, 0]
         if task.fitness == "progress":
             fitness = travel / task.duration
@@ -304,7 +315,7 @@ class Simulator:
         else:
             fitness = np.full(len(steps), np.nan)
         if task.fitness == "area":
-            fitness = task.body.area(final.astype(np.float64))[:, 0] / task.area_reference[0]
+            fitness = _in_pieces(lambda p: task.body.area(p)[:, 0], final) / task.area_reference[0]
         out = Rollout(fitness=fitness, steps=steps, solved=solved, com=com, start=start, position=final)
         if callable(task.fitness):
             fitness = np.asarray(task.fitness(out), dtype=np.float64)
@@ -394,6 +405,12 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def _in_pieces(measure: Callable[[np.ndarray], np.ndarray], position: np.ndarray) -> np.ndarray:
+    """What `measure` finds of every agent's `position` [agent, mass, 2] in float64, of which there is no whole copy."""
+    parts = _cut(len(position), max(1, -(-len(position) // AGENTS_AT_ONCE)))
+    return np.concatenate([measure(position[part].astype(np.float64)) for part in parts])
 
 
 def _parts(agents: int, threads: int) -> list[slice]:

@@ -179,19 +179,29 @@ def usable_threads(threads: Sequence[int]) -> list[int]:
     return usable
 
 
+def peak_memory() -> int:
+    """Peak resident memory of this process [byte]. Raises `Skipped` on Windows, which does not tell."""
+    try:  # of this program alone; the other counts its parent until it was loaded
+        with open("/proc/self/status", encoding="ascii") as file:
+            return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM"))
+    except OSError:
+        pass
+    if sys.platform == "win32":
+        raise Skipped("peak memory is not told on Windows")
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
 MEMORY = """
 import sys, numpy, turgor
+from turgor.bench.parts import peak_memory
 body, agents, steps = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 task = turgor.make_task("hilly", body=body, steps=steps)
 theta = numpy.random.default_rng(0).uniform(-1, 1, (agents, task.parameter_count))
 simulator = turgor.Simulator(task)
 simulator.rollout(theta)
-try:  # of this program alone; the other counts its parent until it was loaded
-    peak = next(int(line.split()[1]) * 1024 for line in open("/proc/self/status") if line.startswith("VmHWM"))
-except OSError:
-    import resource
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-print(peak, theta.nbytes, simulator.threads)
+print(peak_memory(), theta.nbytes, simulator.threads)
 """
 
 

@@ -28,6 +28,8 @@ from turgor.cli.words import controlled, name_of, say, spread, unit_of
 if TYPE_CHECKING:
     from turgor.runs import Champion, Run
 
+FIGURE, FILM = "fitness.png", "champion.mp4"
+
 
 def _evolve_options(parser: Parser) -> None:
     add = parser.add_argument
@@ -127,6 +129,10 @@ def _resume(options: argparse.Namespace) -> None:
     from turgor.runs import Run, current_versions
 
     run = Run.open(options.run)
+    if options.evaluations is None and run.status == "done":
+        say(f"{run.path} is evolved")
+        _finish(run, options)
+        return
     now = current_versions()
     changed = [f"{name} {was} -> {now[name]}" for name, was in run.versions.items() if now.get(name, was) != was]
     if changed:
@@ -153,18 +159,22 @@ def _watched(out: Path, work: Callable[[ProgressDisplay], Run]) -> Run:
 
 
 def _finish(run: Run, options: argparse.Namespace) -> None:
-    """Draws the run and sums it up."""
+    """Draws what is missing, because the run was ended before, or is an earlier champion's; and sums the run up."""
+    from turgor.runs import CHAMPION
     from turgor.view.figures import fitness_figure
 
     assert run.path is not None
     started = time.perf_counter()
     name, unit, champion = name_of(run.task, run.settings.recipe), unit_of(run.task), run.checked_champion()
-    fitness_figure(run.history, run.path / "fitness.png", unit=unit.strip(), title=name)
-    (run.path / "champion.mp4").unlink(missing_ok=True)  # of a run resumed: an earlier champion's
-    if not options.no_video:
-        say("drawing champion.mp4 ...")
+    for path in (run.path / FIGURE, run.path / FILM):
+        if path.exists() and path.stat().st_mtime < (run.path / CHAMPION).stat().st_mtime:
+            path.unlink()
+    if not (run.path / FIGURE).exists():
+        fitness_figure(run.history, run.path / FIGURE, unit=unit.strip(), title=name)
+    if not (options.no_video or (run.path / FILM).exists()):
+        say(f"drawing {FILM} ...")
         try:
-            draw_video(run, run.path / "champion.mp4", (1280, 720))
+            draw_video(run, run.path / FILM, (1280, 720))
         except KeyboardInterrupt:
             raise Interrupted(f"kept in {run.path}, whole; turgor video {run.path} draws it") from None
     drawing = time.perf_counter() - started

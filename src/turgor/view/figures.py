@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from turgor.errors import InvalidInput, describe
+from turgor.files import whole
 
 BEST, MEDIAN, SIGMA = "#0072B2", "#D55E00", "#555555"  # Okabe and Ito's colours: told apart by everyone
 
@@ -35,12 +36,8 @@ def fitness_figure(
     for axes in (upper, lower):
         axes.grid(color="#dddddd", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
-    try:
+    with whole(path) as partial:
         figure.savefig(partial)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path
 
 

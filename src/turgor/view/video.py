@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from turgor.errors import InvalidInput, describe, one_of
+from turgor.files import whole
 from turgor.recording import Recording
 from turgor.view.draw import Painter, checked_size
 
@@ -70,16 +71,11 @@ def write_video(
     if gif and fps > 50:
         raise InvalidInput("fps: expected at most 50 frames/s for a GIF", describe(fps))
     painter = Painter(recording, size, title, pressure_range=pressure_range)
-    # av knows the format by the suffix
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
-    try:
+    with whole(path) as partial:  # with the suffix of `path`: av knows the format by it
         if gif:
             _encode_gif(painter, steps, partial, fps, progress)
         else:
             _encode(painter, steps, partial, fps, crf, progress)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path
 
 
