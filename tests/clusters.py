@@ -21,7 +21,7 @@ class RealCluster:
         self._processes: list[subprocess.Popen[bytes]] = []
         self._file = folder / "scheduler.json"
         self.scheduler = self._start("scheduler", "--port", "0", "--scheduler-file", str(self._file))
-        wait_until(self._file.exists)
+        wait_until(lambda: self._file.exists() and self._file.read_text().endswith("}"))  # Dask writes it in place
         self.address: str = json.loads(self._file.read_text())["address"]
 
     def __enter__(self) -> RealCluster:
