@@ -282,6 +282,23 @@ def test_interrupted_and_continued_gives_the_same_bytes(in_one_go, tmp_path):
     assert tables_of(other) == tables_of(folder)
 
 
+def test_killed_and_started_again_at_once_it_gives_the_same_bytes(in_one_go, tmp_path):
+    folder, _ = in_one_go
+    other = tmp_path / "campaign"
+    command = [sys.executable, "-m", "turgor", "reproduce", *TINY, "--threads", "2", "--out", str(other)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    wait_for_rows(other, process)
+    second = turgor(*command[3:])
+    assert second.returncode == 2
+    assert f"wait for that one, or end it; got process {process.pid} on" in second.stderr
+    assert second.stderr.count("\n") == 1
+    process.kill()
+    process.wait()
+    done = turgor(*command[3:])
+    assert done.returncode == 0, done.stderr
+    assert tables_of(other) == tables_of(folder)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="counts processes in /proc")
 def test_when_the_first_process_is_killed_the_others_keep_their_runs_and_end(tmp_path):
     folder = tmp_path / "campaign"

@@ -19,7 +19,7 @@ PROGRAMS = {
     page.stem: "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL))
     for page in PAGES
 }
-NEEDS = ("cmaes", "ribs", "stable_baselines3")  # packages of examples, which turgor itself does without
+NEEDS = ("cmaes", "distributed", "ribs", "stable_baselines3")  # packages of examples, which turgor itself does without
 SHORT = {"train_ppo": ["--steps", "64", "--agents", "2"]}  # options that make an example short
 
 

@@ -141,6 +141,12 @@ FOUND: dict[str, tuple[Callable[[], Any], str]] = {
     "a replay of endless springs": (
         lambda: read_replay(replay_with("spring_range", [-1e308, 1e308])), "replay: expected the bytes of a replay"
     ),
+    "a replay of 2^53 masses": (
+        lambda: read_replay(replay_with("masses", 2**53)), "bytes of a replay; got positions of shape"
+    ),
+    "a replay of nothing but brackets": (
+        lambda: read_replay(b"TGR1" + struct.pack("<I", 100_000) + b"[" * 100_000), "replay: expected the bytes"
+    ),
     "a replay that unpacks to 100 MB": (lambda: read_replay(bomb()), "replay: expected the bytes of a replay"),
 }  # fmt: skip
 

@@ -19,6 +19,10 @@ def one_line(text: str) -> str:
     return line if len(line) <= LONGEST else line[: LONGEST - 3] + "..."
 
 
+class WorkLost(InvalidInput):
+    """The machines that did the work are gone: what was in hand is lost, what was done before is not."""
+
+
 def describe(value: object) -> str:
     """A short, one-line form of `value` for an error message."""
     text = " ".join(str(value).split())

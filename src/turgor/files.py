@@ -24,6 +24,7 @@ from turgor.errors import InvalidInput, describe
 LOCK = ".lock"
 PARTIALS = ".*.partial*"  # files that were being written
 OWN = (".json", ".csv", ".npz")  # what is written under the lock alone
+PATIENCE = 3.0  # [s]: the processes of a campaign whose first one was killed end within a generation
 FORGOTTEN = 3600.0  # [s] after which nobody draws a picture any more
 DIGEST = "sha256"  # the array that holds the checksum of the others
 ARRAYS_BYTES = 500_000_000  # larger files of arrays are not read
@@ -185,7 +186,10 @@ class FolderLock:
 
         handle = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            if not self._lock(lock_descriptor, handle):
+            until = time.monotonic() + PATIENCE
+            while not (locked := self._lock(lock_descriptor, handle)) and time.monotonic() < until:
+                time.sleep(PATIENCE / 50)
+            if not locked:
                 os.lseek(handle, 1, os.SEEK_SET)
                 owner = os.read(handle, 200).decode(errors="replace")
                 folder = self._path.parent

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from turgor.cli.words import say
@@ -118,6 +119,25 @@ def _parsed(kind: Callable[[str], Any], text: str, name: str) -> Any:
 def add_threads(parser: Parser) -> None:
     """An option for the number of threads."""
     parser.add_argument("--threads", type=count, metavar="N", help="of the simulator (default: all cores)")
+
+
+def add_cluster(parser: Parser, text: str) -> None:
+    """An option for the cluster that does the work; `text` says what it is given."""
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help=f"{text}: tcp://HOST:PORT of a Dask scheduler, or local:N for N processes here; the same bits, whatever "
+        "the workers (docs/cluster.md) (default: none)",
+    )
+
+
+def connected(address: str | None) -> AbstractContextManager[Any]:
+    """A Dask client of the cluster at `address`; None where none is asked for. Raises `InvalidInput`."""
+    if address is None:
+        return nullcontext()
+    from turgor.cluster.connect import connect
+
+    return connect(address)
 
 
 def add_variants(parser: Parser) -> None:

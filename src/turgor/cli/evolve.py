@@ -10,7 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from turgor.cli.champion import draw_video
-from turgor.cli.command import Command, Interrupted, Parser, add_threads, add_variants, count, number, whole
+from turgor.cli.command import (
+    Command,
+    Interrupted,
+    Parser,
+    add_cluster,
+    add_threads,
+    add_variants,
+    connected,
+    count,
+    number,
+    whole,
+)
 from turgor.cli.progress import ProgressDisplay
 from turgor.cli.words import controlled, name_of, say, spread, unit_of
 
@@ -68,6 +79,7 @@ def _resume_options(parser: Parser) -> None:
 def _evolution_options(parser: Parser, text: str, default: int | None) -> None:
     parser.add_argument("--evaluations", type=count, default=default, metavar="N", help=text)
     add_threads(parser)
+    add_cluster(parser, "spreads generations of 256 agents and more")
     parser.add_argument("--no-video", action="store_true", help="do not draw champion.mp4 at the end")
 
 
@@ -94,19 +106,21 @@ def _evolve(options: argparse.Namespace) -> None:
         f"evolving {name_of(task, recipe)}: {task.parameter_count:,} parameters, {options.evaluations:,} evaluations "
         f"-> {out}"
     )
-    run = _watched(
-        out,
-        lambda display: evolve(
-            task,
-            options.evaluations,
-            options.seed,
+    with connected(options.cluster) as executor:
+        run = _watched(
             out,
-            strategy=strategy,
-            threads=options.threads,
-            progress=display,
-            recipe=recipe,
-        ),
-    )
+            lambda display: evolve(
+                task,
+                options.evaluations,
+                options.seed,
+                out,
+                strategy=strategy,
+                threads=options.threads,
+                progress=display,
+                recipe=recipe,
+                executor=executor,
+            ),
+        )
     _finish(run, options)
 
 
@@ -124,9 +138,13 @@ def _resume(options: argparse.Namespace) -> None:
     if changed:
         say(f"note: {', '.join(changed)}: results may differ from those of a run without a pause")
     say(f"resuming {name_of(run.task, run.settings.recipe)} after {run.evaluations:,} evaluations -> {run.path}")
-    run = _watched(
-        options.run, lambda display: resume(run, options.evaluations, threads=options.threads, progress=display)
-    )
+    with connected(options.cluster) as executor:
+        run = _watched(
+            options.run,
+            lambda display: resume(
+                run, options.evaluations, threads=options.threads, progress=display, executor=executor
+            ),
+        )
     _finish(run, options)
 
 
@@ -189,6 +207,7 @@ EVOLVE = Command(
     "  turgor evolve\n"
     "  turgor evolve --task escape --body large --condition springs --seed 3\n"
     "  turgor evolve --body large --strategy sep-cma-es --population 50\n"
+    "  turgor evolve --strategy sep-cma-es --population 10000 --evaluations 1000000 --cluster tcp://host:8786\n"
     "  turgor evolve --gravity 9.81 --window 15 --observation unit --out runs/variant",
     _evolve_options,
     _evolve,

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from turgor.cli.command import Command, Interrupted, Parser, count
+from turgor.cli.command import Command, Interrupted, Parser, add_cluster, connected, count
 from turgor.cli.progress import CampaignDisplay
 from turgor.cli.words import say
 
@@ -44,6 +44,7 @@ def _reproduce_options(parser: Parser) -> None:
         help="a look in under a minute: 2 seeds, 1000 evaluations, small and medium, in runs/quick",
     )
     add("--threads", type=count, metavar="N", help="cores to use (default: all)")
+    add_cluster(parser, "does the runs")
     add("--no-videos", action="store_true", help="leave the champions' videos out of the report")
     add("--out", type=Path, metavar="FOLDER", help="of the campaign, new or to go on with (default: runs/paper)")
 
@@ -59,7 +60,7 @@ def _reproduce(options: argparse.Namespace) -> None:
     what = f"{' '.join(options.only)}: {', '.join(bodies)}; {seeds} seeds, {evaluations:,} evaluations"
     say(f"reproducing {what} -> {out}")
     try:
-        with CampaignDisplay() as display:
+        with connected(options.cluster) as executor, CampaignDisplay() as display:
             report = reproduce(
                 out,
                 questions=options.only,
@@ -70,6 +71,7 @@ def _reproduce(options: argparse.Namespace) -> None:
                 videos=not options.no_videos,
                 progress=display,
                 say=say,
+                executor=executor,
             )
     except KeyboardInterrupt:
         raise Interrupted(f"every run is kept in {out}; the same command goes on") from None
@@ -85,7 +87,8 @@ REPRODUCE = Command(
     "  turgor reproduce --quick\n"
     "  turgor reproduce\n"
     "  turgor reproduce --only rq2 --body small --seeds 20\n"
-    "  turgor reproduce --only rq0 rq1 rq2 studies\n\n"
+    "  turgor reproduce --only rq0 rq1 rq2 studies\n"
+    "  turgor reproduce --cluster tcp://host:8786\n\n"
     "Interrupted, the same command goes on where it stopped.",
     _reproduce_options,
     _reproduce,

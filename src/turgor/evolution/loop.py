@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from turgor.arrays import as_numbers
-from turgor.errors import InvalidInput, describe
+from turgor.errors import InvalidInput, WorkLost, describe
 from turgor.evolution import STRATEGIES
 from turgor.evolution.strategy import Degenerate, Strategy, built_in
 from turgor.files import NotWritten
-from turgor.runs import MOST_REPEATS, RECORD, Champion, Run, Settings, current_versions
+from turgor.runs import MOST_REPEATS, RECORD, Champion, Checkpoint, Run, Settings, current_versions
 from turgor.simulate import Rollout, Simulator, perturbed
 from turgor.task import Task
 
@@ -54,6 +54,7 @@ def evolve(
     progress: Callable[[Progress], object] | None = None,
     robust_repeats: int = 30,
     recipe: Mapping[str, Any] | None = None,
+    executor: Any = None,
 ) -> Run:
     """The `Run` that evolves a controller for `task`: its champion, its history and, in the folder `out`, its files.
 
@@ -65,12 +66,33 @@ def evolve(
     a built-in one, "cma-es", "sep-cma-es", "lm-ma-es" or "openai-es", or makes a `Strategy` from the number of
     parameters and the randomness, as `functools.partial(SepCMAES, population=100)` does. `progress` is called after
     every generation. `recipe` is kept in run.json: the arguments of `make_task`. `out=None` keeps all in memory.
+    `executor`: a Dask `Client`, over whose workers generations of a few hundred agents and more are spread, with the
+    same bits whatever the workers are and whatever becomes of them (docs/cluster.md); None: all is done here.
 
     Ctrl-C ends it after the generation in hand, a second one at once: what was evolved is kept in `out`,
     `resume` goes on from there, and `KeyboardInterrupt` is raised. Raises `InvalidInput` for a task without anything
-    to evolve, an unknown strategy, a folder that is not empty, or where no agent of the first generation has a fitness.
+    to evolve, an unknown strategy, a folder that is not empty, or where no agent of the first generation has a fitness;
+    and, once what was evolved is kept, where the scheduler or all workers of `executor` are gone.
     """
     started = time.perf_counter()
+    simulator = _simulator(task, threads, executor)
+    with _told_what_is_kept(out):
+        run, optimizer = begin(task, evaluations, seed, out, strategy, simulator.threads, robust_repeats, recipe)
+        with contextlib.closing(run):
+            return _carry_on(run, simulator, optimizer, progress, _Clock(run.seconds, started))
+
+
+def begin(
+    task: Task,
+    evaluations: int,
+    seed: int,
+    out: str | os.PathLike[str] | None,
+    strategy: str | MakeStrategy,
+    threads: int,
+    robust_repeats: int = 30,
+    recipe: Mapping[str, Any] | None = None,
+) -> tuple[Run, Strategy]:
+    """A new run and its strategy, before the first generation; see `evolve`."""
     for name, value in (("evaluations", evaluations), ("robust_repeats", robust_repeats)):
         if not isinstance(value, int) or value < 1:
             raise InvalidInput(f"{name}: expected a whole number, at least 1", describe(value))
@@ -79,7 +101,6 @@ def evolve(
     if task.parameter_count == 0:
         raise InvalidInput("evolve: expected a condition that controls something", f"{task.name}, {task.condition}")
     make = built_in(strategy) if isinstance(strategy, str) else strategy
-    simulator = Simulator(task, threads=threads)
     optimizer = make(task.parameter_count, np.random.default_rng(seed))
     settings = Settings(
         evaluations=evaluations,
@@ -87,12 +108,11 @@ def evolve(
         strategy=optimizer.name,
         population=optimizer.population,
         sigma=float(optimizer.sigma),
-        threads=simulator.threads,
+        threads=threads,
         robust_repeats=robust_repeats,
         recipe=None if recipe is None else dict(recipe),
     )
-    with _told_what_is_kept(out), contextlib.closing(Run.create(task, settings, out)) as run:
-        return _carry_on(run, simulator, optimizer, progress, started)
+    return Run.create(task, settings, out), optimizer
 
 
 def resume(
@@ -102,13 +122,15 @@ def resume(
     strategy: str | MakeStrategy | None = None,
     threads: int | None = None,
     progress: Callable[[Progress], object] | None = None,
+    executor: Any = None,
 ) -> Run:
     """`run`, taken up where it was left, to its end or to `evaluations`: with the same bits as without the pause.
 
     It goes on from its last checkpoint; what came after is evolved again. `strategy` is what `evolve` was given; None
-    for a built-in one, which run.json names. Raises `InvalidInput` for a run that another
-    process writes, that has no evaluations left, whose strategy is another one or not known, or of which no checkpoint
-    can be read.
+    for a built-in one, which run.json names. `executor` is as in `evolve`, whatever the run was started with.
+
+    Raises `InvalidInput` for a run that another process writes, that has no evaluations left, whose strategy is another
+    one or not known, or of which no checkpoint can be read.
     """
     started = time.perf_counter()
     run.claim()
@@ -121,20 +143,57 @@ def resume(
             raise InvalidInput(f"evaluations: expected more than the {run.evaluations} that are done", str(budget))
         if run.status == "done" and run.note:
             raise InvalidInput(f"resume: expected a run that can go on; {run.note}")
-        make = _as_started(settings, strategy) if strategy is None or isinstance(strategy, str) else strategy
-        simulator = Simulator(run.task, threads=threads)
-        optimizer = make(run.task.parameter_count, np.random.default_rng(settings.seed))
-        if optimizer.name != settings.strategy:
-            raise InvalidInput(f"strategy: expected {settings.strategy}", optimizer.name)
+        simulator = _simulator(run.task, threads, executor)
         checkpoint = run.read_checkpoint()
-        if checkpoint.state is not None:
-            optimizer.restore(checkpoint.state)
-        if optimizer.population != settings.population:
-            raise InvalidInput(f"strategy: expected a population of {settings.population}", str(optimizer.population))
-        run.settings = msgspec.structs.replace(settings, evaluations=budget, threads=simulator.threads)
-        run.status, run.note, run.versions = "running", None, current_versions()
-        run.go_back(checkpoint)
-        return _carry_on(run, simulator, optimizer, progress, started)
+        optimizer = _restored(run, checkpoint, strategy)
+        reopen(run, checkpoint, msgspec.structs.replace(settings, evaluations=budget, threads=simulator.threads))
+        return _carry_on(run, simulator, optimizer, progress, _Clock(run.seconds, started))
+
+
+def reopen(run: Run, checkpoint: Checkpoint, settings: Settings) -> None:
+    """Has `run` go back to `checkpoint`, to be evolved by `settings` from there."""
+    run.settings = settings
+    run.status, run.note, run.versions = "running", None, current_versions()
+    run.go_back(checkpoint)
+
+
+def evolve_a_while(
+    run: Run,
+    checkpoint: Checkpoint,
+    strategy: MakeStrategy,
+    seconds: float,
+    progress: Callable[[Progress], object] | None = None,
+) -> dict[str, np.ndarray] | None:
+    """Takes up `run`, which is in memory and stands at `checkpoint`, for `seconds` of the clock or to its end; then its
+    status is "running" or "done". Where the pause falls leaves no trace in the bits. Returns the strategy's state; None
+    where it cannot go on."""
+    started = time.perf_counter()
+    optimizer = _restored(run, checkpoint, strategy)
+    simulator, clock = Simulator(run.task, threads=run.settings.threads), _Clock(run.seconds, started)
+    _carry_on(run, simulator, optimizer, progress, clock, until=started + seconds)
+    return optimizer.state() if run.note is None else None
+
+
+def _simulator(task: Task, threads: int | None, executor: Any) -> Simulator:
+    if executor is None:
+        return Simulator(task, threads=threads)
+    from turgor.cluster.shards import ShardedSimulator
+
+    return ShardedSimulator(task, executor, threads=threads)
+
+
+def _restored(run: Run, checkpoint: Checkpoint, strategy: str | MakeStrategy | None) -> Strategy:
+    """The strategy that `run` was started with, as it was at `checkpoint`; raises `InvalidInput` for another one."""
+    settings = run.settings
+    make = _as_started(settings, strategy) if strategy is None or isinstance(strategy, str) else strategy
+    optimizer = make(run.task.parameter_count, np.random.default_rng(settings.seed))
+    if optimizer.name != settings.strategy:
+        raise InvalidInput(f"strategy: expected {settings.strategy}", optimizer.name)
+    if checkpoint.state is not None:
+        optimizer.restore(checkpoint.state)
+    if optimizer.population != settings.population:
+        raise InvalidInput(f"strategy: expected a population of {settings.population}", str(optimizer.population))
+    return optimizer
 
 
 def _as_started(settings: Settings, name: str | None) -> MakeStrategy:
@@ -160,19 +219,23 @@ def _carry_on(
     simulator: Simulator,
     optimizer: Strategy,
     progress: Callable[[Progress], object] | None,
-    started: float,
+    clock: _Clock,
+    until: float = math.inf,
 ) -> Run:
-    """Evolves `run` to its end and writes it down, whatever ends it."""
-    clock = _Clock(run.seconds, started)
+    """Evolves `run` to its end, or `until` a time of `perf_counter`, and writes it down, whatever ends it."""
     with _gentle_interrupt() as interrupt:
         try:
-            _generations(run, simulator, optimizer, progress, clock, interrupt)
-            run.status = "done"
+            _generations(run, simulator, optimizer, progress, clock, interrupt, until)
+            run.status = "done" if run.evaluations >= run.settings.evaluations else "running"
         except Degenerate as reason:
             run.status, run.note = "done", f"stopped in generation {run.generation + 1}: {reason}"
         except KeyboardInterrupt:
             run.status = "interrupted"
             raise
+        except WorkLost as lost:
+            run.status = "interrupted"
+            kept = "the run was in memory alone" if run.path is None else f"turgor resume {run.path} goes on"
+            raise InvalidInput(f"{lost}; {run.generation} generations were done; {kept}") from None
         except NotWritten as error:
             run.status, run.note = "interrupted", str(error)
             raise
@@ -185,7 +248,7 @@ def _carry_on(
                     _measure_champion(run, simulator)
             # a strategy that stopped, or was stopped amid its work, has no state to go on from
             whole = run.status != "failed" and run.note is None and not interrupt.forced
-            _save(run, optimizer if whole else None, clock)
+            save(run, optimizer.state() if whole else None, clock.seconds())
     if interrupt.wanted:
         raise KeyboardInterrupt
     return run
@@ -209,6 +272,7 @@ def _generations(
     progress: Callable[[Progress], object] | None,
     clock: _Clock,
     interrupt: _Interrupt,
+    until: float,
 ) -> None:
     saved, first = time.perf_counter(), run.evaluations
     with clock.of("start"):
@@ -229,8 +293,10 @@ def _generations(
             progress(_progress(run, median, sigma, rate))
         if interrupt.wanted:
             raise KeyboardInterrupt
+        if now > until:
+            return
         if now - saved > CHECKPOINT_INTERVAL:
-            _save(run, optimizer, clock)
+            save(run, optimizer.state(), clock.seconds())
             saved = time.perf_counter()
 
 
@@ -288,12 +354,13 @@ def _progress(run: Run, median: float, sigma: float, rate: float) -> Progress:
     )
 
 
-def _save(run: Run, optimizer: Strategy | None, clock: _Clock) -> None:
-    """Writes down everything; run.json last, because it says that the others are there."""
+def save(run: Run, state: dict[str, np.ndarray] | None, seconds: Mapping[str, float]) -> None:
+    """Writes down everything, with the strategy's `state` if there is one, and where the `seconds` went; run.json last,
+    because it says that the others are there."""
     run.write_champion()
-    if optimizer is not None:
-        run.write_checkpoint(optimizer.state())
-    run.seconds = clock.seconds()
+    if state is not None:
+        run.write_checkpoint(state)
+    run.seconds = dict(seconds)
     run.write_record()
 
 

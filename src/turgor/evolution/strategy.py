@@ -198,6 +198,13 @@ def numerics() -> Generator[None]:
 
 
 @cache
+def hold_blas() -> None:
+    """Has BLAS use one thread in this process from now on: `numerics` of several Python threads would undo each other's
+    limit."""
+    _blas().limit(limits=1)
+
+
+@cache
 def _blas() -> Any:
     from threadpoolctl import ThreadpoolController
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import msgspec
 
-from turgor.errors import InvalidInput, describe
+from turgor.errors import InvalidInput, WorkLost, describe
 from turgor.evolution.cma_es import CMAES
 from turgor.evolution.loop import Progress as RunProgress
 from turgor.evolution.loop import evolve, resume
@@ -49,11 +49,13 @@ def run_entries(
     entries: Sequence[Entry],
     workers: int | None = None,
     progress: Callable[[Progress], object] | None = None,
+    executor: Any = None,
 ) -> list[Measured]:
     """What every one of `entries` achieved, in their order; their runs are in `folder`, and go on where they stopped.
 
     Finished runs are measured, not run again. Ctrl-C stops every run after the generation in hand and raises
-    `KeyboardInterrupt`. Raises `InvalidInput` for a run in `folder` that was made with other settings.
+    `KeyboardInterrupt`. `executor`: a Dask `Client`, whose workers then do all the work, with the same results. Raises
+    `InvalidInput` for a run in `folder` that was made with other settings.
     """
     if workers is not None and (not isinstance(workers, int) or workers < 1):
         raise InvalidInput("workers: expected a whole number, at least 1", describe(workers))
@@ -61,6 +63,9 @@ def run_entries(
     costs = {entry: cost(entry) * (1 - share) for entry, share in shares.items()}
     if not entries:
         return []
+    if executor is not None:
+        found = _on_cluster(folder, costs, executor, _Display(shares, progress))
+        return [found[entry] for entry in entries]
     context = multiprocessing.get_context("spawn")
     reports, stop = context.Queue(), context.Event()
     count = min(workers or available_cores(), len(entries))
@@ -235,6 +240,17 @@ def _gather(
             start()
             display.finish(entry, found[entry])
     return found
+
+
+def _on_cluster(folder: Path, costs: Mapping[Entry, float], executor: Any, display: _Display) -> dict[Entry, Measured]:
+    from turgor.cluster.crew import Crew
+    from turgor.experiments.pieces import run_in_pieces
+
+    crew = Crew(executor, whole_runs=True)
+    try:
+        return run_in_pieces(folder, partial(open_run, folder), Schedule(costs, max(crew.workers, 1)), crew, display)
+    except WorkLost as lost:
+        raise InvalidInput(f"{lost}; every run is kept in {folder}; the same command goes on") from None
 
 
 class _Display:

@@ -30,7 +30,7 @@ from turgor.experiments.measure import STARTS, Measured
 from turgor.experiments.plan import BODIES, make_plan
 from turgor.experiments.report import Film, Method, write_report
 from turgor.experiments.rows import Tables, write_tables
-from turgor.files import write_whole
+from turgor.files import FolderLock, is_left_over, write_whole, writing
 from turgor.physics.batch import load_kernel
 from turgor.recording import Recording
 from turgor.runs import current_versions, machine
@@ -58,46 +58,48 @@ def reproduce(
     videos: bool = True,
     progress: Callable[[Progress], object] | None = None,
     say: Callable[[str], object] = lambda text: None,
+    executor: Any = None,
 ) -> Path:
     """Path of the report on `questions` ("rq0", "rq1", "rq2", "studies"), after all runs that it needs.
 
     The campaign's folder is `out`. Started again it goes on where it stopped, and runs nothing twice; more seeds,
     bodies or questions add runs. The report tells of what this call asks for. Its numbers do not depend on `threads`
     (cores in use; None: all) or on interruptions. `progress` is called as runs go on, `say` with a line for every
-    other part.
+    other part. `executor`: a Dask `Client`, whose workers then do the runs, with the same results (docs/cluster.md);
+    tables, figures, videos and report are made here.
 
     Processes are spawned: call it under `if __name__ == "__main__"`. Raises `InvalidInput` for a folder that holds
     something else, or runs with other settings; `KeyboardInterrupt` once every run has kept what it has.
     """
     began, folder = time.perf_counter(), Path(out)
     entries = make_plan(questions, bodies, seeds, evaluations)
-    _claim_folder(folder)
-    load_kernel()  # compiles it, if it has to be, before every process would
-    measured = run_entries(folder, entries, threads, progress)
+    with _claimed(folder):
+        load_kernel()  # compiles it, if it has to be, before every process would
+        measured = run_entries(folder, entries, threads, progress, executor)
 
-    with _drawers(threads) as pool:
-        films = [pool.submit(_film, m, folder / "videos") for m in _chosen(measured)] if videos else []
-        say(f"inflation, statistics, tables, figures{f', {len(films)} videos' if films else ''} ...")
-        tables = _find_tables(measured, [b for b in BODIES if b in bodies] if "rq0" in questions else [])
-        write_tables(folder / "tables", tables)
-        recordings = {m.entry.name: record(m) for m in measured if m.entry.question == "rq1"}
-        figures = draw_figures(tables, recordings, folder / "figures")
-    method = Method(
-        settings={
-            "questions": list(questions),
-            "bodies": list(bodies),
-            "seeds": seeds,
-            "evaluations": evaluations,
-            "starts": STARTS,
-            "threads": threads or available_cores(),
-        },
-        versions=current_versions(),
-        machine=machine(),
-        seconds={m.entry.name: m.seconds["total"] for m in measured if m.seconds},
-        wall=time.perf_counter() - began,
-        made=datetime.date.today().isoformat(),
-    )
-    return write_report(folder / "report.html", tables, figures, [film.result() for film in films], method)
+        with _drawers(threads) as pool:
+            films = [pool.submit(_film, m, folder / "videos") for m in _chosen(measured)] if videos else []
+            say(f"inflation, statistics, tables, figures{f', {len(films)} videos' if films else ''} ...")
+            tables = _find_tables(measured, [b for b in BODIES if b in bodies] if "rq0" in questions else [])
+            write_tables(folder / "tables", tables)
+            recordings = {m.entry.name: record(m) for m in measured if m.entry.question == "rq1"}
+            figures = draw_figures(tables, recordings, folder / "figures")
+        method = Method(
+            settings={
+                "questions": list(questions),
+                "bodies": list(bodies),
+                "seeds": seeds,
+                "evaluations": evaluations,
+                "starts": STARTS,
+                "threads": threads or available_cores(),
+            },
+            versions=current_versions(),
+            machine=machine(),
+            seconds={m.entry.name: m.seconds["total"] for m in measured if m.seconds},
+            wall=time.perf_counter() - began,
+            made=datetime.date.today().isoformat(),
+        )
+        return write_report(folder / "report.html", tables, figures, [film.result() for film in films], method)
 
 
 def record(measured: Measured) -> Recording:
@@ -105,8 +107,23 @@ def record(measured: Measured) -> Recording:
     return Simulator(measured.entry.make_judge(), threads=1).record(measured.theta)
 
 
-def _claim_folder(folder: Path) -> None:
-    """Makes `folder` a campaign's; raises `InvalidInput` for one that holds something else."""
+@contextlib.contextmanager
+def _claimed(folder: Path) -> Generator[None]:
+    """Makes `folder` a campaign's, and keeps other processes from it. Raises `InvalidInput` for one that is in use or
+    holds something else."""
+    _check_folder(folder)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    lock = FolderLock(folder)
+    try:
+        if not (folder / MARK).exists():
+            write_whole(folder / MARK, msgspec.json.encode({"format": FORMAT}) + b"\n")
+        yield
+    finally:
+        lock.release()
+
+
+def _check_folder(folder: Path) -> None:
     mark = folder / MARK
     if mark.exists():
         try:
@@ -116,10 +133,8 @@ def _claim_folder(folder: Path) -> None:
         if found != FORMAT:
             raise InvalidInput(f"{mark}: expected a campaign of format {FORMAT}", f"format {describe(found)}")
         return
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and not (folder.is_dir() and all(is_left_over(path) for path in folder.iterdir())):
         raise InvalidInput("out: expected a new or empty folder, or a campaign's", f"{folder}, which holds other files")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(mark, msgspec.json.encode({"format": FORMAT}) + b"\n")
 
 
 def _find_tables(measured: Sequence[Measured], inflated: Sequence[str]) -> Tables:

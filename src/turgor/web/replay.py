@@ -230,7 +230,7 @@ class Replay(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 Kind = Literal["int32", "int16", "uint8", "float32"]
-BROKEN = (ValueError, KeyError, TypeError, OverflowError, struct.error, zlib.error, msgspec.DecodeError)
+BROKEN = (ValueError, KeyError, TypeError, OverflowError, RecursionError, struct.error, zlib.error, msgspec.DecodeError)
 
 
 def read_replay(data: bytes) -> Replay:
@@ -253,6 +253,8 @@ def read_replay(data: bytes) -> Replay:
             arrays[entry["name"]] = np.frombuffer(stream, kind, count, first).reshape(shape)
             first += count * kind.itemsize
         moved = np.concatenate([arrays["origin"][None], arrays["position"]]).astype(np.int64)
+        if moved.shape[1:] != (header.masses, 2):
+            raise ValueError(f"positions of shape {list(moved.shape)}")
         low, high = header.spring_range
         if not max(abs(low), abs(high), *map(abs, header.rest)) <= LARGEST:
             raise ValueError("springs of no length")

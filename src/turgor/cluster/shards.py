@@ -1,0 +1,95 @@
+"""Shards: a population cut into parts, each simulated by a worker of its own."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from functools import lru_cache
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from turgor.cluster.crew import Crew
+from turgor.control import Sinusoid, check_theta
+from turgor.physics.model import WIDTH
+from turgor.simulate import Rollout, Simulator
+from turgor.task import Task
+
+SMALLEST, LARGEST = 128, 512  # [agent], of a shard: far more work than the way to a worker and back; far less than all
+SHARDS_A_THREAD = 4  # at most: so that they end together, and a death costs little
+IN_HAND_A_THREAD = 2  # one is simulated while the next is on its way
+
+
+class ShardedSimulator(Simulator):
+    """A `Simulator` whose large batches are simulated by a cluster's workers, with the same bits."""
+
+    def __init__(self, task: Task, executor: Any, *, threads: int | None = None) -> None:
+        """`executor`: a Dask `Client`; `threads`: of this machine, for small batches. Raises `InvalidInput`."""
+        super().__init__(task, threads=threads)
+        self._crew = Crew(executor)
+        self._task_sent = _packed(task)
+        self._said = False
+
+    def rollout(self, theta: ArrayLike, position: ArrayLike | None = None) -> Rollout:
+        """What `Simulator.rollout` returns. Too few agents for two shards, and starts of their own, are simulated here.
+
+        Raises also what `Crew.wait` raises.
+        """
+        theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
+        if position is not None:
+            return super().rollout(theta, position)
+        if len(theta) < 2 * SMALLEST:
+            self._say_once(f"{len(theta)} agents are too few to spread (from {2 * SMALLEST} on); simulated here")
+            return super().rollout(theta)
+        shards = cut_into_shards(self._as_sent(theta), self._crew.threads)
+        final, steps, solved = (np.concatenate(parts) for parts in zip(*self._simulated(shards), strict=True))
+        return self._judge(self._starts(len(theta), None), final, steps, solved)
+
+    def _simulated(self, shards: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Final positions, steps and solved of every shard, in their order."""
+        crew, answers, begun = self._crew, dict[Any, Any](), 0
+        try:
+            while len(answers) < len(shards):
+                while begun < len(shards) and crew.jobs < max(IN_HAND_A_THREAD * crew.threads, 1):
+                    crew.give(begun, simulate_shard, self._task_sent, shards[begun])
+                    begun += 1
+                answers.update(crew.wait())
+        finally:
+            crew.drop()
+        return [answers[k] for k in range(len(shards))]
+
+    def _as_sent(self, theta: np.ndarray) -> np.ndarray:
+        """Half the bytes, where the kernel rounds to float32 before it does anything else."""
+        return theta if isinstance(self.task.controller, Sinusoid) else theta.astype(np.float32)
+
+    def _say_once(self, text: str) -> None:
+        if not self._said:
+            self._said = True
+            print(f"turgor: {text}", file=sys.stderr, flush=True)
+
+
+def cut_into_shards(theta: np.ndarray, threads: int) -> list[np.ndarray]:
+    """`theta` [agent, parameter] in parts of whole blocks, for workers of so many `threads` in all."""
+    wanted = -(-len(theta) // max(SHARDS_A_THREAD * threads, 1))
+    agents = -(-min(max(wanted, SMALLEST), LARGEST) // WIDTH) * WIDTH
+    return [theta[k : k + agents] for k in range(0, len(theta), agents)]
+
+
+def simulate_shard(task: bytes, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Final positions [agent, mass, 2], steps [agent] and solved [agent] of `theta` [agent, parameter]: on a worker."""
+    out = _simulator(task).rollout(theta)
+    return out.position, out.steps, out.solved
+
+
+@lru_cache(maxsize=8)
+def _simulator(task: bytes) -> Simulator:
+    return Simulator(pickle.loads(task), threads=1)
+
+
+def _packed(task: Task) -> bytes:
+    """`task` without its fitness, which is judged where all agents are seen; an end of the user's own goes along."""
+    import cloudpickle
+
+    return cloudpickle.dumps(msgspec.structs.replace(task, fitness="progress"))
