@@ -303,7 +303,7 @@ def test_impossible_settings_are_refused(name: str, change: dict[str, Any]) -> N
 
 def test_openai_es_takes_pairs_and_a_positive_rate() -> None:
     assert [OpenAIES(n, rng()).population for n in (374, 784, 1344)] == [22, 24, 26]
-    with pytest.raises(InvalidInput, match="population: expected an even whole number, 4 to 100000; got 7"):
+    with pytest.raises(InvalidInput, match="population: expected an even whole number, 4 to 1000000; got 7"):
         OpenAIES(5, rng(), population=7)
     with pytest.raises(InvalidInput, match="alpha: expected a positive number"):
         OpenAIES(5, rng(), alpha=0.0)

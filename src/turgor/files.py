@@ -27,7 +27,7 @@ OWN = (".json", ".csv", ".npz")  # what is written under the lock alone
 PATIENCE = 3.0  # [s]: the processes of a campaign whose first one was killed end within a generation
 FORGOTTEN = 3600.0  # [s] after which nobody draws a picture any more
 DIGEST = "sha256"  # the array that holds the checksum of the others
-ARRAYS_BYTES = 500_000_000  # larger files of arrays are not read
+ARRAYS_BYTES = 4_000_000_000  # larger files of arrays are not read
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 log = logging.getLogger("turgor")

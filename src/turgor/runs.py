@@ -49,7 +49,7 @@ _RANGES = {
     "threads": (1, LARGEST_INTEGER),
     "robust_repeats": (1, MOST_REPEATS),
 }
-RECORD_BYTES, HISTORY_BYTES = 50_000_000, 200_000_000  # larger files are not read
+RECORD_BYTES, HISTORY_BYTES = 50_000_000, 1_000_000_000  # larger files are not read: 10 million generations
 
 Row = tuple[int, int, float, float, float, float]
 Status = Literal["running", "done", "interrupted", "failed"]

@@ -19,7 +19,7 @@ from turgor.body import Body
 from turgor.control import check_theta, observation_count, output_count
 from turgor.errors import InvalidInput, describe
 from turgor.physics.batch import Batch, World, load_kernel
-from turgor.physics.memory import BYTES, MOST_BYTES, check_memory
+from turgor.physics.memory import BYTES, MOST_BYTES, MOST_TRACE_BYTES, check_memory
 from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH
 from turgor.recording import Recording
 from turgor.scene import LARGEST_COORDINATE, Scene
@@ -238,7 +238,9 @@ class Simulator:
         drive, script = CONTROLLER, None
         if task.pressure is not None:
             columns = task.body.spring_count + task.body.chamber_count
-            check_memory("steps: expected fewer with a given pressure", BYTES * WIDTH * task.steps * columns)
+            check_memory(
+                "steps: expected fewer with a given pressure", BYTES * WIDTH * task.steps * columns, MOST_TRACE_BYTES
+            )
             lengths = np.repeat(task.body.rest_length[None], task.steps, axis=0)
             drive, script = REPLAY, np.concatenate([lengths, task.pressure], axis=1)
         if callable(task.end):

@@ -22,7 +22,7 @@ from turgor.evolution import STRATEGIES
 WORST = 1e300  # cost of an agent without a fitness: finite, so that sums stay finite
 SMALLEST_SIGMA = 1e-150  # its square is still a number
 LARGEST_NUMBER = 1e15  # [1], of a controller: what the simulator takes
-MOST_AGENTS, MOST_NUMBERS = 100_000, 20_000_000  # of a generation, and numbers in all of their controllers
+MOST_AGENTS, MOST_NUMBERS = 1_000_000, 200_000_000  # of a generation, and numbers in all of their controllers
 UINT64 = 2**64
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from turgor.body import Body
 from turgor.control import pack
 from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, room_for
-from turgor.physics.memory import BYTES, LINE, Width, aligned, check_memory, fields
+from turgor.physics.memory import BYTES, LINE, MOST_TRACE_BYTES, Width, aligned, check_memory, fields
 from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
 from turgor.physics.step import run_blocks
 from turgor.physics.tables import ground_tables, make_kernel, write_ground
@@ -89,7 +89,7 @@ class Batch:
         than can be recorded."""
         body = self.kernel.lengths
         row = 5 * body["mass"] + body["spring"] + body["chamber"] + body["input"]
-        check_memory("steps: expected fewer to be recorded", BYTES * WIDTH * row * (steps + 1))
+        check_memory("steps: expected fewer to be recorded", BYTES * WIDTH * row * (steps + 1), MOST_TRACE_BYTES)
         return aligned(steps + 1, row * WIDTH).reshape(steps + 1, row, WIDTH)
 
     def run(

@@ -25,6 +25,7 @@ from turgor.errors import InvalidInput
 from turgor.physics.lanes import ELEMENT, SCALAR, Lanes, as_lanes, intrinsic
 
 MOST_BYTES = 256_000_000  # of one piece of memory; what would take more is refused
+MOST_TRACE_BYTES = 4_000_000_000  # the same of a recording, which grows with the steps
 LINE = 64  # [byte], a cache line and the widest vector
 BYTES = 4  # of a float32 and an int32
 
@@ -191,10 +192,10 @@ FIELD: dict[Any, tuple[str, bool]] = {
 }
 
 
-def check_memory(expected: str, size: int) -> None:
+def check_memory(expected: str, size: int, most: int = MOST_BYTES) -> None:
     """Raises `InvalidInput` where `size` bytes are more than a single piece of memory may have."""
-    if size > MOST_BYTES:
-        raise InvalidInput(f"{expected}, in at most {MOST_BYTES / 1e6:.0f} MB", f"{size / 1e6:.0f} MB")
+    if size > most:
+        raise InvalidInput(f"{expected}, in at most {most / 1e6:.0f} MB", f"{size / 1e6:.0f} MB")
 
 
 @cache
