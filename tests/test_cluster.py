@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-import runpy
 import shlex
 import shutil
 import subprocess
@@ -296,14 +295,24 @@ def test_a_time_out_is_taken_from_the_environment() -> None:
     assert (float(done.stdout), done.stderr) == (120.0, "")
 
 
+def _job_of(example: Path) -> str:
+    """The job that dask-jobqueue would submit; in a process of its own, because its import takes Ctrl-C away."""
+    code = (
+        "import runpy, sys\n"
+        "example = runpy.run_path(sys.argv[1])\n"
+        "local = {'host': '127.0.0.1', 'dashboard_address': '127.0.0.1:0'}\n"
+        "with example['make_cluster'](scheduler_options=local) as cluster:\n"
+        "    print(cluster.job_script())"
+    )
+    command = [sys.executable, "-W", "error", "-c", code, str(example)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+
+
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_the_job_files_for_slurm_are_shell() -> None:
     files = [(ROOT / "examples" / "cluster" / "turgor.sbatch").read_text(encoding="utf-8")]
     if importlib.util.find_spec("dask_jobqueue"):
-        example = runpy.run_path(str(ROOT / "examples" / "cluster" / "slurm.py"))
-        local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-        with example["make_cluster"](scheduler_options=local) as cluster:
-            files.append(cluster.job_script())
+        files.append(_job_of(ROOT / "examples" / "cluster" / "slurm.py"))
         assert "--nthreads 1 " in files[1]
         assert "--nworkers 16 " in files[1]
         assert "OPENBLAS_NUM_THREADS=1" in files[1]

@@ -28,7 +28,8 @@ from turgor.evolution.loop import evaluate, evolve, resume
 from turgor.evolution.sep_cma_es import SepCMAES
 from turgor.files import read_arrays, read_whole, write_arrays
 from turgor.physics.ground import cut_into_columns
-from turgor.runs import Run, Settings
+from turgor.records import Settings
+from turgor.runs import Run
 from turgor.scene import Scene, flat, hills
 from turgor.simulate import Simulator
 from turgor.task import Leave, make_task, task_from_json, task_to_json

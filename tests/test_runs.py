@@ -21,7 +21,8 @@ from turgor.errors import InvalidInput
 from turgor.evolution import loop
 from turgor.evolution.loop import Progress, evolve, resume
 from turgor.files import NotWritten, read_arrays, write_arrays, write_whole
-from turgor.runs import COLUMNS, FORMATS, Run, free_folder
+from turgor.records import COLUMNS, FORMATS
+from turgor.runs import Run, free_folder
 from turgor.simulate import Simulator
 from turgor.task import Task, make_task
 

@@ -19,112 +19,42 @@ import contextlib
 import csv
 import hashlib
 import importlib.metadata
-import io
-import math
 import os
 import platform
 import sys
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, TextIO
 
 import msgspec
 import numpy as np
 
-from turgor.errors import LARGEST_INTEGER, InvalidInput, describe
-from turgor.files import FolderLock, is_left_over, log, read_arrays, read_whole, write_arrays, write_whole, writing
+from turgor.errors import InvalidInput, describe
+from turgor.files import FolderLock, is_left_over, log, read_arrays, write_arrays, write_whole, writing
+from turgor.records import (
+    CHAMPION,
+    CHECKPOINT,
+    COLUMNS,
+    FORMAT,
+    HISTORY,
+    PREVIOUS,
+    RECORD,
+    Champion,
+    Checkpoint,
+    Record,
+    Row,
+    Settings,
+    Status,
+    champion_arrays,
+    checked_rows,
+    history_text,
+    read_champion,
+    read_history,
+    read_record,
+    record_text,
+)
 from turgor.task import Task, task_from_json, task_to_json
 
-FORMAT = 2  # 1: without checksums, and without the history in the checkpoint
-FORMATS = (1, 2)
-RECORD, HISTORY, CHAMPION = "run.json", "history.csv", "champion.npz"
-CHECKPOINT, PREVIOUS = "checkpoint.npz", "checkpoint.previous.npz"
-COLUMNS = ("generation", "evaluations", "best", "median", "sigma", "seconds")
 PACKAGES = ("turgor", "numpy", "numba", "cma")
-
-MOST_REPEATS = 100_000
-_RANGES = {
-    "evaluations": (1, LARGEST_INTEGER),
-    "seed": (0, LARGEST_INTEGER),
-    "population": (1, LARGEST_INTEGER),
-    "threads": (1, LARGEST_INTEGER),
-    "robust_repeats": (1, MOST_REPEATS),
-}
-RECORD_BYTES, HISTORY_BYTES = 50_000_000, 1_000_000_000  # larger files are not read: 10 million generations
-
-Row = tuple[int, int, float, float, float, float]
-Status = Literal["running", "done", "interrupted", "failed"]
-
-
-class Settings(msgspec.Struct, frozen=True, kw_only=True):
-    """How a run evolves."""
-
-    evaluations: int  # at least; whole generations
-    seed: int
-    strategy: str
-    population: int
-    threads: int
-    sigma: float | None = None  # of the strategy at the start [1]; None: its default
-    robust_repeats: int = 30
-    recipe: dict[str, Any] | None = None  # arguments of `make_task`, where known
-
-    def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-                raise InvalidInput(f"{name}: expected a whole number, {low} to {high}", describe(value))
-        if self.sigma is not None and not 0 < self.sigma < math.inf:
-            raise InvalidInput("sigma: expected a positive number", describe(self.sigma))
-
-
-class Champion(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """The best agent so far."""
-
-    theta: Any  # float64 [parameter]
-    fitness: float
-    steps: int
-    solved: bool
-    generation: int  # it was found in
-    robust: Any = None  # [repeat], its fitness from slightly moved starts; None: not measured yet
-    robust_solved: Any = None  # [repeat], bool
-
-    def __repr__(self) -> str:
-        robust = "" if self.robust_fitness is None else f", robust {self.robust_fitness:.3f}"
-        return f"Champion(fitness {self.fitness:.3f}{robust}, generation {self.generation})"
-
-    @property
-    def robust_fitness(self) -> float | None:
-        """Median fitness from slightly moved starts."""
-        with np.errstate(over="ignore"):
-            return None if self.robust is None else float(np.median(np.asarray(self.robust, dtype=np.float64)))
-
-
-class Checkpoint(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """A run after one of its generations."""
-
-    rows: list[Row] = []  # its history
-    champion: Champion | None = None
-    solver: Champion | None = None
-    state: dict[str, Any] | None = None  # of the strategy; None: before its first generation
-    is_previous: bool = False  # the one before the last, which cannot be read
-
-    @property
-    def generation(self) -> int:
-        return len(self.rows)
-
-
-class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What run.json holds."""
-
-    format: int
-    status: Status
-    note: str | None
-    settings: Settings
-    seconds: dict[str, float]
-    versions: dict[str, str]
-    machine: dict[str, Any]
-    task: dict[str, Any]
-    history: str | None = None  # checksum of history.csv; None: it grows, or the format is 1
-    result: dict[str, Any] = {}  # for readers; champion.npz and history.csv are what counts
 
 
 class Run:
@@ -177,7 +107,7 @@ class Run:
         own. A history or champion that is torn is taken from the last checkpoint, and a warning logged. Raises
         `InvalidInput` that names the file, what was expected and what was found."""
         folder = Path(path)
-        record = _read_record(folder)
+        record = read_record(folder)
         run = cls(task_from_json(record.task) if task is None else task, record.settings, folder)
         run._load(record)
         return run
@@ -191,7 +121,7 @@ class Run:
             return
         self._lock = FolderLock(self.path)
         try:
-            self._load(_read_record(self.path))
+            self._load(read_record(self.path))
         except BaseException:
             self.close()
             raise
@@ -204,7 +134,7 @@ class Run:
         self.seconds, self.versions = record.seconds, record.versions
         self._checksums = record.format > 1
         try:
-            self.rows = _read_history(self.path / HISTORY, record.history)
+            self.rows = read_history(self.path / HISTORY, record.history)
         except InvalidInput as error:
             checkpoint = self._rescue(error)
             if checkpoint is None and self.status != "running":
@@ -216,7 +146,7 @@ class Run:
             return
         try:
             arrays = read_arrays(path, checksum=self._checksums)
-            self.champion, self.solver = (_champion(arrays, prefix, self.task, path) for prefix in ("", "solver_"))
+            self.champion, self.solver = (read_champion(arrays, prefix, self.task, path) for prefix in ("", "solver_"))
             if self.champion is None:
                 raise InvalidInput(f"{path}: expected the arrays of a champion", "no theta")
         except InvalidInput as error:
@@ -274,14 +204,9 @@ class Run:
             return
         self._stop_growing()
         path = self.path / HISTORY
-        write_whole(path, self._history_text())
+        write_whole(path, history_text(self.rows))
         with writing(path):
             self._growing = open(path, "a", buffering=1, encoding="ascii", newline="")  # noqa: SIM115
-
-    def _history_text(self) -> bytes:
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([COLUMNS, *self.rows])
-        return text.getvalue().encode()
 
     def _stop_growing(self) -> None:
         if self._growing is not None:
@@ -302,14 +227,15 @@ class Run:
     def write_champion(self) -> None:
         """Writes champion.npz."""
         if self.path is not None and self.champion is not None:
-            write_arrays(self.path / CHAMPION, {**_arrays(self.champion, ""), **_arrays(self.solver, "solver_")})
+            arrays = {**champion_arrays(self.champion, ""), **champion_arrays(self.solver, "solver_")}
+            write_arrays(self.path / CHAMPION, arrays)
 
     def write_checkpoint(self, state: dict[str, np.ndarray]) -> None:
         """Writes checkpoint.npz: from what `resume` goes on. The one before is kept beside it."""
         if self.path is None:
             return
         arrays = {f"strategy_{name}": value for name, value in state.items()}
-        arrays |= {**_arrays(self.champion, "champion_"), **_arrays(self.solver, "solver_")}
+        arrays |= {**champion_arrays(self.champion, "champion_"), **champion_arrays(self.solver, "solver_")}
         arrays["history"] = np.array(self.rows, dtype=np.float64).reshape(-1, len(COLUMNS))
         with writing(self.path / CHECKPOINT):
             if self._growing is not None:
@@ -346,7 +272,7 @@ class Run:
             history = arrays["history"]
             if history.ndim != 2 or history.dtype != np.float64:
                 raise InvalidInput(f"{path}: expected a table of float64 in history", str(history.dtype))
-            rows = _checked_rows(history.tolist(), path)
+            rows = checked_rows(history.tolist(), path)
         else:  # of format 1
             generation = arrays.get("generation", np.array(-1))
             if generation.shape or not 0 <= generation <= self.generation:
@@ -355,8 +281,8 @@ class Run:
             rows = self.rows[: int(generation)]
         return Checkpoint(
             rows=rows,
-            champion=_champion(arrays, "champion_", self.task, path),
-            solver=_champion(arrays, "solver_", self.task, path),
+            champion=read_champion(arrays, "champion_", self.task, path),
+            solver=read_champion(arrays, "solver_", self.task, path),
             state={name.removeprefix("strategy_"): a for name, a in arrays.items() if name.startswith("strategy_")},
             is_previous=path.name == PREVIOUS,
         )
@@ -390,7 +316,7 @@ class Run:
         grown = self.status != "running"
         record = Record(
             format=FORMAT,
-            history=hashlib.sha256(self._history_text()).hexdigest() if grown else None,
+            history=hashlib.sha256(history_text(self.rows)).hexdigest() if grown else None,
             status=self.status,
             note=self.note,
             settings=self.settings,
@@ -400,10 +326,7 @@ class Run:
             machine=machine(),
             task=msgspec.json.decode(task_to_json(self.task)),
         )
-        fields = msgspec.to_builtins(record)
-        fields["checksum"] = _checksum(fields)
-        lines = [f'  "{name}": {msgspec.json.encode(value).decode()}' for name, value in fields.items()]
-        write_whole(self.path / RECORD, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
+        write_whole(self.path / RECORD, record_text(record))
 
 
 def check_new(folder: Path) -> None:
@@ -438,105 +361,3 @@ def machine() -> dict[str, Any]:
             names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
         model = names[0] if names else model
     return {"cpu": model, "cores": available_cores(), "platform": platform.platform()}
-
-
-# --- what is read -----------------------------------------------------------------------------------------------------
-
-
-def _read_record(folder: Path) -> Record:
-    path = folder / RECORD
-    if not folder.is_dir():
-        kind = "a file" if folder.exists() else "nothing there"
-        raise InvalidInput(f"{folder}: expected the folder of a run", kind)
-    try:
-        raw = msgspec.json.decode(read_whole(path, RECORD_BYTES))
-    except FileNotFoundError:
-        raise InvalidInput(f"{folder}: expected the folder of a run", f"no {RECORD} in it") from None
-    except OSError as error:
-        raise InvalidInput(f"{path}: expected a file that can be read", error.strerror) from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InvalidInput(f"{path}: expected JSON", describe(error)) from None
-    found = raw.get("format") if isinstance(raw, dict) else None
-    if found not in FORMATS:
-        formats = " or ".join(str(known) for known in FORMATS)
-        raise InvalidInput(f"{path}: expected a run of format {formats}", f"format {describe(found)}")
-    if found > 1 and raw.pop("checksum", None) != _checksum(raw):
-        raise InvalidInput(f"{path}: expected the file that turgor wrote", "a changed one: its checksum differs")
-    try:
-        return msgspec.convert(raw, Record)
-    except msgspec.ValidationError as error:
-        raise InvalidInput(f"{path}: {error}") from None
-
-
-def _checksum(fields: dict[str, Any]) -> str:
-    """Of what run.json holds, however it is laid out."""
-    return hashlib.sha256(msgspec.json.encode(fields)).hexdigest()
-
-
-def _read_history(path: Path, checksum: str | None) -> list[Row]:
-    """The rows of history.csv; a last line without an end was being written, and is left out."""
-    try:
-        data = read_whole(path, HISTORY_BYTES)
-        lines = data.decode("ascii").split("\n")
-        found = list(csv.reader(lines[:-1]))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInput(f"{path}: expected a table in ASCII", getattr(error, "strerror", None) or "else") from None
-    header = found[0] if found else []
-    if tuple(header) != COLUMNS:
-        raise InvalidInput(f"{path}: expected the columns {', '.join(COLUMNS)}", describe(",".join(header)))
-    rows = _checked_rows(found[1:], path)
-    if checksum is not None and hashlib.sha256(data).hexdigest() != checksum:
-        raise InvalidInput(f"{path}: expected the table that turgor wrote", "a changed one: its checksum differs")
-    return rows
-
-
-def _checked_rows(found: list[list[Any]], path: Path) -> list[Row]:
-    """Rows of a history, of text or numbers; raises `InvalidInput` that names `path`."""
-    rows: list[Row] = []
-    for k, row in enumerate(found, start=1):
-        try:
-            generation, evaluations, *numbers = row
-            best, median, sigma, seconds = (float(number) for number in numbers)
-            rows.append((int(generation), int(evaluations), best, median, sigma, seconds))
-        except (ValueError, TypeError, OverflowError):
-            text = describe(",".join(str(value) for value in row) if isinstance(row, list) else row)
-            raise InvalidInput(f"{path}: expected {len(COLUMNS)} numbers in row {k}", text) from None
-        if rows[-1][0] != k:
-            raise InvalidInput(f"{path}: expected generation {k} in row {k}", describe(rows[-1][0]))
-        if rows[-1][1] <= (rows[-2][1] if k > 1 else 0):
-            raise InvalidInput(f"{path}: expected more evaluations in row {k} than before", describe(rows[-1][1]))
-    return rows
-
-
-def _arrays(champion: Champion | None, prefix: str) -> dict[str, np.ndarray]:
-    fields = {} if champion is None else msgspec.structs.asdict(champion)
-    return {prefix + name: np.asarray(value) for name, value in fields.items() if value is not None}
-
-
-def _champion(arrays: dict[str, np.ndarray], prefix: str, task: Task, path: Path) -> Champion | None:
-    """The inverse of `_arrays`; raises `InvalidInput` that names `path`."""
-    fields: dict[str, Any] = {
-        name: arrays[prefix + name] for name in Champion.__struct_fields__ if prefix + name in arrays
-    }
-    if "theta" not in fields:
-        return None
-    theta, shape = fields["theta"], (task.parameter_count,)
-    if theta.shape != shape or theta.dtype != np.float64:
-        found = f"{theta.dtype} {list(theta.shape)}"
-        raise InvalidInput(f"{path}: expected {prefix}theta as float64 {list(shape)}", found)
-    for name in ("fitness", "steps", "solved", "generation"):
-        value = fields.get(name, np.zeros(0))
-        if value.shape or value.dtype.kind not in "biuf":
-            raise InvalidInput(f"{path}: expected one number in {prefix}{name}", f"shape {list(value.shape)}")
-        number = value.item()
-        if name != "fitness" and not 0 <= number <= LARGEST_INTEGER:
-            raise InvalidInput(f"{path}: expected 0 or more in {prefix}{name}", describe(number))
-        fields[name] = {"fitness": float, "solved": bool}.get(name, int)(number)
-    for name in ("robust", "robust_solved"):
-        value = fields.get(name, np.zeros(1))
-        if value.ndim != 1 or not 0 < len(value) <= MOST_REPEATS or value.dtype.kind not in "biuf":
-            found = f"{value.dtype} {list(value.shape)}"
-            raise InvalidInput(f"{path}: expected numbers of shape [repeat] in {prefix}{name}", found)
-    if not (np.isfinite(theta).all() and np.isfinite(fields["fitness"])):
-        raise InvalidInput(f"{path}: expected finite numbers in {prefix}theta and {prefix}fitness", "NaN or infinity")
-    return Champion(**fields)

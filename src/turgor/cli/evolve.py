@@ -26,7 +26,8 @@ from turgor.cli.progress import ProgressDisplay
 from turgor.cli.words import controlled, name_of, say, spread, unit_of
 
 if TYPE_CHECKING:
-    from turgor.runs import Champion, Run
+    from turgor.records import Champion
+    from turgor.runs import Run
 
 FIGURE, FILM = "fitness.png", "champion.mp4"
 
@@ -160,7 +161,7 @@ def _watched(out: Path, work: Callable[[ProgressDisplay], Run]) -> Run:
 
 def _finish(run: Run, options: argparse.Namespace) -> None:
     """Draws what is missing, because the run was ended before, or is an earlier champion's; and sums the run up."""
-    from turgor.runs import CHAMPION
+    from turgor.records import CHAMPION
     from turgor.view.figures import fitness_figure
 
     assert run.path is not None

@@ -22,7 +22,8 @@ from turgor.errors import InvalidInput, WorkLost, describe
 from turgor.evolution import STRATEGIES
 from turgor.evolution.strategy import Degenerate, Strategy, built_in
 from turgor.files import NotWritten
-from turgor.runs import MOST_REPEATS, RECORD, Champion, Checkpoint, Run, Settings, current_versions
+from turgor.records import MOST_REPEATS, RECORD, Champion, Checkpoint, Settings
+from turgor.runs import Run, current_versions
 from turgor.simulate import Rollout, Simulator, perturbed
 from turgor.task import Task
 

@@ -24,7 +24,8 @@ from turgor.evolution.strategy import hold_blas
 from turgor.experiments.measure import Measured, measure
 from turgor.experiments.plan import Entry
 from turgor.files import NotWritten
-from turgor.runs import Checkpoint, Run, Settings
+from turgor.records import Checkpoint, Settings
+from turgor.runs import Run
 
 REPORT_INTERVAL = 0.5  # [s], between two reports of a run
 

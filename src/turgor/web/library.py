@@ -16,7 +16,8 @@ import numpy as np
 
 from turgor.errors import InvalidInput, describe
 from turgor.experiments.rows import Champion, read_rows
-from turgor.runs import CHECKPOINT, COLUMNS, PREVIOUS, Run
+from turgor.records import CHECKPOINT, COLUMNS, PREVIOUS
+from turgor.runs import Run
 from turgor.web.guard import Refused, check_file
 from turgor.web.watch import (
     CHAMPION_BYTES,

@@ -16,7 +16,7 @@ import msgspec
 from turgor.body import SIZES
 from turgor.errors import LARGEST_INTEGER, InvalidInput, describe
 from turgor.files import read_arrays
-from turgor.runs import COLUMNS, FORMATS, Row, Settings, Status
+from turgor.records import COLUMNS, FORMATS, Row, Settings, Status
 from turgor.web.guard import check_file
 
 RECORD_BYTES, HISTORY_BYTES, CHAMPION_BYTES, CHECKPOINT_BYTES = 5_000_000, 50_000_000, 50_000_000, 500_000_000
