@@ -299,12 +299,13 @@ def draw_curves(axes: Any, rows: list[Row]) -> None:
     for way, colour, marker in zip(ways, COLOURS, MARKERS, strict=False):
         mine = [row for row in rows if row["way"] == way]
         x, y = [row["cores"] for row in mine], [row["evaluations"] * DAY for row in mine]
-        axes.plot(x, y, color=colour, marker=marker, markersize=4, linewidth=1.5, label=way)
+        hidden = way == ways[0]  # by the next one, where the scheduler is not the limit
+        axes.plot(x, y, color=colour, marker=marker, markersize=8 if hidden else 4, linewidth=1.5, label=way)
     x = [row["cores"] for row in rows if row["way"] == ways[0]]
     y = [row["ideal"] * DAY for row in rows if row["way"] == ways[0]]
     axes.plot(x, y, ":", color="#555555", label="engine alone")
     axes.set(xlabel="cores", ylabel="evaluations a day")
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
     axes.set_title("One coordinator, one scheduler, small bodies (modelled)", loc="left", fontsize=10)
 
 
@@ -317,6 +318,8 @@ def draw_optimizers(axes: Any, rows: list[Row], engine: list[Row]) -> None:
         axes.plot(x, y, color=colour, marker=marker, markersize=4, linewidth=1.5, label=name)
     rate = max(row["rate"] for row in engine if row["parameters"] == parameters)
     axes.axhline(1e6 * 1800 / rate, linestyle=":", color="#555555", label="simulating it on one core")
-    axes.set(xlabel="population", ylabel="ask + tell [µs an agent]")
-    axes.legend(frameon=False, fontsize=8)
+    axes.set(xscale="log", yscale="log")
+    low, high = axes.get_ylim()
+    axes.set(xlabel="population", ylabel="ask + tell [µs an agent]", ylim=(low / 4, high))  # room for the legend
+    axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2)
     axes.set_title(f"What an agent costs the optimizer, {parameters:.0f} parameters", loc="left", fontsize=10)
