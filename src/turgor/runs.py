@@ -272,6 +272,8 @@ class Run:
             history = arrays["history"]
             if history.ndim != 2 or history.dtype != np.float64:
                 raise InvalidInput(f"{path}: expected a table of float64 in history", str(history.dtype))
+            if not np.array_equal(history[:, :1], np.arange(1, len(history) + 1)[:, None]):  # before it becomes a list
+                raise InvalidInput(f"{path}: expected generations 1 to {len(history)} in history", "others")
             rows = checked_rows(history.tolist(), path)
         else:  # of format 1
             generation = arrays.get("generation", np.array(-1))
