@@ -335,20 +335,25 @@ def test_a_processor_that_calculates_differently_gets_simulations_but_no_whole_r
 # --- Ctrl-C -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(os.name == "nt", reason="sends Ctrl-C to a group of processes")
-def test_ctrl_c_keeps_the_run_and_leaves_no_process(alone: tuple[Any, ...], tmp_path: Path) -> None:
+@pytest.mark.skipif(os.name == "nt", reason="sends signals to a group of processes")
+@pytest.mark.parametrize("how", ["Ctrl-C", "kill -9"])
+def test_a_coordinator_that_is_ended_keeps_the_run_and_leaves_no_process(
+    how: str, alone: tuple[Any, ...], tmp_path: Path
+) -> None:
     folder, evaluations = tmp_path / "run", GENERATIONS * POPULATION
     options = ("--population", POPULATION, "--strategy", "sep-cma-es", "--steps", 600, "--no-video")
     process = start_turgor("evolve", *options, "--evaluations", evaluations, "--cluster", "local:2", "--out", folder)
     wait_for_rows(folder, process)
-    os.killpg(process.pid, signal.SIGINT)
-    error = errors_of(process.communicate(timeout=60)[1])
-    assert (process.returncode, error) == (
-        130,
-        f"turgor: interrupted; kept in {folder}; turgor resume {folder} goes on\n",
-    )
+    if how == "Ctrl-C":
+        os.killpg(process.pid, signal.SIGINT)  # it reaches every process of a terminal
+        error = errors_of(process.communicate(timeout=60)[1])
+        kept = f"turgor: interrupted; kept in {folder}; turgor resume {folder} goes on\n"
+        assert (process.returncode, error) == (130, kept)
+    else:
+        process.kill()  # the first process alone
+        process.communicate(timeout=60)
     with pytest.raises(ProcessLookupError):
-        wait_until(lambda: os.killpg(process.pid, 0), 5)
+        wait_until(lambda: os.killpg(process.pid, 0), 20)
     assert bits_of(resume(Run.open(folder), strategy=SPREAD)) == alone
 
 
