@@ -89,7 +89,7 @@ def _client_of(distributed: Any, address: str) -> Client:
     try:
         return distributed.Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, RuntimeError) as error:
-        reason = describe(error.__cause__ or error)
+        reason = describe(error.__cause__ or error) or f"no answer for {CONNECT_TIMEOUT:g} s"
         raise InvalidInput(f"cluster: expected a Dask scheduler at {address} (dask scheduler)", reason) from None
 
 

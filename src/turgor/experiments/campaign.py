@@ -31,6 +31,7 @@ from turgor.experiments.plan import Entry
 from turgor.runs import Run
 from turgor.simulate import available_cores
 
+LEAST_KNOWN = 1e-3  # of the work: before, nothing is told of the rest
 REPORT_INTERVAL = 0.2  # [s], between two reports of a run
 
 
@@ -281,7 +282,8 @@ class _Display:
             return
         work = sum(self._cost[n] * (share - self._first[n]) for n, share in self._share.items())
         left = sum(self._cost[n] * (1 - share) for n, share in self._share.items())
-        seconds = left * (time.monotonic() - self._began) / work if work > 0 else None
+        known = work > LEAST_KNOWN * (work + left)
+        seconds = left * (time.monotonic() - self._began) / work if known else None
         self._show(
             Progress(
                 running=dict(sorted(self._running.items())),
