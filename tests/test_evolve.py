@@ -139,12 +139,24 @@ def test_state_is_a_copy() -> None:
         ({"ps": np.zeros(3)}, r"shape \[30\] in ps"),
         ({"sigma": np.array(np.nan)}, "finite numbers of shape"),
         ({"mean": np.array(["a"] * 30)}, "finite numbers"),
+        ({"C": -np.eye(30)}, "positive variances in C"),
     ],
 )
 def test_state_of_another_kind_is_refused(change: dict[str, Any], text: str) -> None:
     state: dict[str, Any] = {**CMAES(30, np.random.default_rng(3)).state(), **change}
     with pytest.raises(InvalidInput, match=text):
         CMAES(30, np.random.default_rng(0)).restore({k: v for k, v in state.items() if v is not None})
+
+
+def test_covariance_that_a_changed_state_turns_negative_is_told() -> None:
+    strategy = CMAES(120, np.random.default_rng(0))
+    generations(strategy, 3)
+    state = strategy.state()
+    strategy.restore({**state, "B": state["B"] * 1e-3})
+    with pytest.raises(Degenerate, match="variance has become negative") as error:
+        generations(strategy, 5)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 120
 
 
 def test_bits_do_not_depend_on_the_threads_of_blas() -> None:

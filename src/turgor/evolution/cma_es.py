@@ -111,6 +111,8 @@ class CMAES:
         names = (*self._OF_EVOLUTION, *self._OF_SAMPLER, *self._OF_STEP_SIZE, "population")
         shapes = {"mean": "n", "pc": "n", "ps": "n", "D": "n", "B": "nn", "C": "nn"}
         check_state(self.name, state, {name: shapes.get(name, "") for name in names})
+        if not (np.diagonal(state["C"]) > 0).all():
+            raise InvalidInput(f"state of {self.name}: expected positive variances in C")
         self._start(np.array(state["mean"]), float(state["sigma"]), int(state["population"]))
         evolution = self._evolution
         _put(evolution, state, self._OF_EVOLUTION)

@@ -193,8 +193,9 @@ def numerics() -> Generator[None]:
     try:
         with _blas().limit(limits=1), np.errstate(over="raise", divide="raise", invalid="raise"):
             yield
-    except (ArithmeticError, AssertionError, RecursionError, np.linalg.LinAlgError) as error:
-        raise Degenerate(f"its numbers broke down ({type(error).__name__} {error})".replace(" )", ")")) from error
+    except (ArithmeticError, AssertionError, RuntimeError, np.linalg.LinAlgError) as error:
+        reason = f"{type(error).__name__} {describe(error)}".strip()
+        raise Degenerate(f"its numbers broke down ({reason})") from error
 
 
 @cache
