@@ -140,6 +140,7 @@ def test_state_is_a_copy() -> None:
         ({"sigma": np.array(np.nan)}, "finite numbers of shape"),
         ({"mean": np.array(["a"] * 30)}, "finite numbers"),
         ({"C": -np.eye(30)}, "positive variances in C"),
+        ({"D": np.zeros(30)}, "positive numbers in D"),
     ],
 )
 def test_state_of_another_kind_is_refused(change: dict[str, Any], text: str) -> None:

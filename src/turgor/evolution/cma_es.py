@@ -111,8 +111,8 @@ class CMAES:
         names = (*self._OF_EVOLUTION, *self._OF_SAMPLER, *self._OF_STEP_SIZE, "population")
         shapes = {"mean": "n", "pc": "n", "ps": "n", "D": "n", "B": "nn", "C": "nn"}
         check_state(self.name, state, {name: shapes.get(name, "") for name in names})
-        if not (np.diagonal(state["C"]) > 0).all():
-            raise InvalidInput(f"state of {self.name}: expected positive variances in C")
+        if not ((np.diagonal(state["C"]) > 0).all() and (state["D"] > 0).all()):
+            raise InvalidInput(f"state of {self.name}: expected positive variances in C, and positive numbers in D")
         self._start(np.array(state["mean"]), float(state["sigma"]), int(state["population"]))
         evolution = self._evolution
         _put(evolution, state, self._OF_EVOLUTION)
@@ -146,7 +146,8 @@ class CMAES:
     def _check(self, numbers: np.ndarray) -> None:
         evolution = self._evolution
         check_numbers(evolution.sigma, numbers, evolution.sm.C)
-        condition = float(evolution.sm.D[-1] / evolution.sm.D[0]) ** 2
+        smallest, largest = float(evolution.sm.D[0]), float(evolution.sm.D[-1])
+        condition = (largest / smallest) ** 2 if smallest > 0 else math.inf
         if condition > LARGEST_CONDITION:
             raise Degenerate(f"its covariance's condition number is {condition:.0e}, too large for float64")
 
