@@ -149,6 +149,16 @@ def test_state_of_another_kind_is_refused(change: dict[str, Any], text: str) -> 
         CMAES(30, np.random.default_rng(0)).restore({k: v for k, v in state.items() if v is not None})
 
 
+@pytest.mark.parametrize("largest", [1e9, 1e200])
+def test_condition_that_a_changed_state_has_is_told(largest: float) -> None:
+    strategy = CMAES(5, np.random.default_rng(0))
+    generations(strategy, 3)
+    state = strategy.state()
+    with pytest.raises(Degenerate, match="condition number is|numbers broke down"):
+        strategy.restore({**state, "D": np.array([1.0, 1.0, 1.0, 1.0, largest])})
+        generations(strategy, 3)
+
+
 def test_covariance_that_a_changed_state_turns_negative_is_told() -> None:
     strategy = CMAES(120, np.random.default_rng(0))
     generations(strategy, 3)

@@ -147,7 +147,8 @@ class CMAES:
         evolution = self._evolution
         check_numbers(evolution.sigma, numbers, evolution.sm.C)
         smallest, largest = float(evolution.sm.D[0]), float(evolution.sm.D[-1])
-        condition = (largest / smallest) ** 2 if smallest > 0 else math.inf
+        ratio = largest / smallest if smallest > 0 else math.inf
+        condition = ratio * ratio  # infinite where `ratio ** 2` would raise
         if condition > LARGEST_CONDITION:
             raise Degenerate(f"its covariance's condition number is {condition:.0e}, too large for float64")
 
