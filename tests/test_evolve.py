@@ -149,14 +149,13 @@ def test_state_of_another_kind_is_refused(change: dict[str, Any], text: str) -> 
         CMAES(30, np.random.default_rng(0)).restore({k: v for k, v in state.items() if v is not None})
 
 
-@pytest.mark.parametrize("largest", [1e9, 1e200])
-def test_condition_that_a_changed_state_has_is_told(largest: float) -> None:
-    strategy = CMAES(5, np.random.default_rng(0))
+@pytest.mark.parametrize("axes", [[1.0, 1e9], [1.0, 1e200], [1e-200, 1e200], [0.0, 1.0]])
+def test_axes_that_float64_cannot_tell_apart_are_told(axes: list[float]) -> None:
+    strategy = CMAES(2, np.random.default_rng(0))
     generations(strategy, 3)
-    state = strategy.state()
-    with pytest.raises(Degenerate, match="condition number is|numbers broke down"):
-        strategy.restore({**state, "D": np.array([1.0, 1.0, 1.0, 1.0, largest])})
-        generations(strategy, 3)
+    strategy._evolution.sm.D = np.array(axes)
+    with pytest.raises(Degenerate, match="condition number is"):
+        strategy._check(np.zeros(2))
 
 
 def test_covariance_that_a_changed_state_turns_negative_is_told() -> None:
