@@ -54,7 +54,9 @@ def bits(folder: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def unharmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("faults") / "unharmed"
-    evolve_with_many_checkpoints(str(folder))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "CHECKPOINT_INTERVAL", 0.0)
+        evolve(make_task("flat", steps=40), out=folder, **RUN)
     return folder
 
 
