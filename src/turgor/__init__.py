@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from turgor.evolution.strategy import Strategy as Strategy
     from turgor.experiments.reproduce import reproduce as reproduce
     from turgor.recording import Recording as Recording
+    from turgor.rollout import Rollout as Rollout
     from turgor.runs import Run as Run
     from turgor.scene import Scene as Scene
     from turgor.scene import cage as cage
     from turgor.scene import flat as flat
     from turgor.scene import hills as hills
-    from turgor.simulate import Rollout as Rollout
     from turgor.simulate import Simulator as Simulator
     from turgor.simulate import Step as Step
     from turgor.simulate import perturbed as perturbed
@@ -66,8 +66,9 @@ _HOME = {
     "turgor.experiments.reproduce": ("reproduce",),
     "turgor.recording": ("Recording",),
     "turgor.runs": ("Run",),
+    "turgor.rollout": ("Rollout",),
     "turgor.scene": ("Scene", "cage", "flat", "hills"),
-    "turgor.simulate": ("Rollout", "Simulator", "Step", "perturbed", "replay"),
+    "turgor.simulate": ("Simulator", "Step", "perturbed", "replay"),
     "turgor.task": ("Leave", "Physics", "Task", "make_task", "resting"),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

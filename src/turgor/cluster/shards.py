@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 from turgor.cluster.crew import Crew
 from turgor.control import Sinusoid, check_theta
 from turgor.physics.model import WIDTH
-from turgor.simulate import Rollout, Simulator
+from turgor.rollout import Rollout, judge, starts_of
+from turgor.simulate import Simulator
 from turgor.task import Task
 
 SMALLEST, LARGEST = 128, 512  # [agent], of a shard: far more work than the way to a worker and back; far less than all
@@ -45,7 +46,7 @@ class ShardedSimulator(Simulator):
             return super().rollout(theta)
         shards = cut_into_shards(self._as_sent(theta), self._crew.threads)
         final, steps, solved = (np.concatenate(parts) for parts in zip(*self._simulated(shards), strict=True))
-        return self._judge(self._starts(len(theta), None), final, steps, solved)
+        return judge(self.task, starts_of(self.task, len(theta), None), final, steps, solved)
 
     def _simulated(self, shards: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Final positions, steps and solved of every shard, in their order."""
