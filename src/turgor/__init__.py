@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from turgor.evolution.strategy import Degenerate as Degenerate
     from turgor.evolution.strategy import Strategy as Strategy
     from turgor.experiments.reproduce import reproduce as reproduce
+    from turgor.fidelity.compare import crosscheck as crosscheck
     from turgor.recording import Recording as Recording
     from turgor.rollout import Rollout as Rollout
     from turgor.runs import Run as Run
@@ -64,6 +65,7 @@ _HOME = {
     "turgor.evolution.sep_cma_es": ("SepCMAES",),
     "turgor.evolution.strategy": ("Degenerate", "Strategy"),
     "turgor.experiments.reproduce": ("reproduce",),
+    "turgor.fidelity.compare": ("crosscheck",),
     "turgor.recording": ("Recording",),
     "turgor.runs": ("Run",),
     "turgor.rollout": ("Rollout",),
