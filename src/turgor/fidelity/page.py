@@ -21,14 +21,16 @@ RANK = 0.9  # rank correlation of random controllers on hills: the goal
 
 HEAD = """# Fidelity: does it hold in Box2D?
 
-The paper's physics engine is Box2D, and a champion that works in ours alone would be an artefact. This page compares turgor with
-the real Box2D, on everything from a single square to the champions of the whole campaign. `turgor crosscheck --suite` makes it, from
-nothing but measurements: the tables behind it are in [fidelity/](fidelity/). For a run of your own, `turgor crosscheck RUN` does
-the same: [crosscheck.md](crosscheck.md), which also tells what was found about the differences that remain.
+The paper's physics engine is Box2D, and a champion that works in ours alone would be an artefact. This page
+compares turgor with the real Box2D, on everything from a single square to the champions of the whole campaign.
+`turgor crosscheck --suite` makes it, from nothing but measurements: the tables behind it are in
+[fidelity/](fidelity/). For a run of your own, `turgor crosscheck RUN` does the same:
+[crosscheck.md](crosscheck.md), which also tells what was found about the differences that remain.
 
-Two faithful engines part from each other, as Box2D parts from itself when a start is moved by a millionth of a metre: contacts are
-chaotic. That is the **floor**, and nothing can agree better. So trajectories are compared while they can be, and from then on
-distributions: of fitness from 30 moved starts, and of 60 random controllers and their order.
+Two faithful engines part from each other, as Box2D parts from itself when a start is moved by a millionth of a
+metre: contacts are chaotic. That is the **floor**, and nothing can agree better. So trajectories are compared while
+they can be, and from then on distributions: of fitness from 30 moved starts, and of 60 random controllers and their
+order.
 """
 
 
@@ -122,7 +124,7 @@ def _short(suite: Suite) -> str:
     p = holm([row.ks_p for row in cells])
     told = f"{int((p < SURE).sum())} of {len(cells)} sets differ; KS distance at most {max(r.ks for r in cells):.2f}"
     lines.append(
-        ("Random controllers in the cage: the same", "no significant difference", told, _yes((p >= SURE).all()))
+        ("Random controllers in the cage: the same", "no significant difference", told, _yes(bool((p >= SURE).all())))
     )
     for engine in _others(suite)[1:]:
         kept = [row.median / row.box2d for row in _of(suite.champions, engine, "hilly") if row.box2d > 1]
@@ -187,8 +189,10 @@ def _golden(suite: Suite) -> str:
     total = [r for r in suite.growth if r.engine == BOX2D]
     text = (
         f"{len(cases)} courses of springs and pressure (free flight, plane, hills, cage; three sizes) and "
-        f"{len({r.case for r in suite.squares})} of single squares were recorded with the C++ sources of Box2D 2.3.2. Box2D 2.3 through "
-        f"its Python package, driven by turgor, gives the same numbers: {len(exact)} of {len(total)} compared frames are equal to the last bit. "
+        f"{len({r.case for r in suite.squares})} of single squares were recorded with the C++ sources of Box2D "
+        f"2.3.2. Box2D 2.3 through "
+        f"its Python package, driven by turgor, gives the same numbers: {len(exact)} of {len(total)} compared frames "
+        f"are equal to the last bit. "
         "Beside the errors stands the floor.\n\n![error growth](images/fidelity-growth.png)\n\n"
     )
     at = {(row.case, row.engine, row.step): row for row in suite.growth}
@@ -232,8 +236,8 @@ def _golden(suite: Suite) -> str:
         ]
         for body in BODIES
     ]
-    text += "\nThe inflation test (RQ0), 30 s on a plane: error of the area ratio in windows of 1 s, worst and median window.\n\n"
-    return text + _table(["body", *(names[e] for e in engines)], lines)
+    told = "The inflation test (RQ0), 30 s on a plane: error of the area ratio in windows of 1 s, worst and median"
+    return f"{text}\n{told}.\n\n" + _table(["body", *(names[e] for e in engines)], lines)
 
 
 def _details(summary: str, text: str) -> str:
@@ -263,8 +267,10 @@ def _contacts(suite: Suite) -> str:
 def _random(suite: Suite) -> str:
     names = _names(suite) | {BOX2D + AGAIN: "Box2D 2.3 again", HERE + AGAIN: "turgor again"}
     text = (
-        '60 controllers with weights uniform in [-1, 1], from the task\'s start ("again": the start moved by 1e-6 m): rank correlation, '
-        "Kolmogorov-Smirnov distance and its p, difference of the means and of the medians with its 95 % interval [m/s].\n\n"
+        '60 controllers with weights uniform in [-1, 1], from the task\'s start ("again": the start moved by 1e-6 m): '
+        "rank correlation, "
+        "Kolmogorov-Smirnov distance and its p, difference of the means and of the medians with its 95 % interval "
+        "[m/s].\n\n"
         "![ranks](images/fidelity-ranks.png)\n\n"
     )
     heads = ["task, body, condition", "engine", "against", "ranks", "KS, p", "means", "medians"]
@@ -289,8 +295,10 @@ def _random_line(row: Ranked, names: dict[str, str]) -> list[str]:
 def _champions(suite: Suite) -> str:
     names = _names(suite)
     text = (
-        f"The champions of the campaign (`turgor reproduce`), evolved in turgor, from {STARTS} starts moved by 1e-6 m in every engine; the floor comes "
-        f"from {STARTS} other starts in Box2D 2.3, and is the interval that holds 95 % of the differences of two medians of {STARTS} starts there.\n\n"
+        f"The champions of the campaign (`turgor reproduce`), evolved in turgor, from {STARTS} starts moved by 1e-6 "
+        f"m in every engine; the floor comes "
+        f"from {STARTS} other starts in Box2D 2.3, and is the interval that holds 95 % of the differences of two "
+        f"medians of {STARTS} starts there.\n\n"
         "![champions](images/fidelity-champions.png)\n\n"
     )
     heads = [
