@@ -8,6 +8,7 @@ from typing import Any
 
 from turgor.experiments.sheets import GREY, INK, PALE, make_sheet, paper_style
 from turgor.fidelity.compare import HERE
+from turgor.fidelity.engines import ENGINES
 from turgor.fidelity.golden import Growth
 from turgor.fidelity.populations import AGAIN, BOX2D, Crossed, Ranked
 from turgor.files import whole
@@ -17,6 +18,7 @@ LOOKS = {
     HERE: ("#0072B2", "o"),
     BOX2D: ("#000000", "|"),
     "box2d-ccd": ("#D55E00", "v"),
+    "box2d-fine": ("#CC79A7", "^"),
     "box2d-v3": ("#009E73", "s"),
 }
 SCENES = {"free": "free flight", "flat": "plane", "hills": "hills", "cage": "cage", "gas": "gas law, plane"}
@@ -102,7 +104,9 @@ def draw_champions(rows: Sequence[Crossed], path: Path) -> None:
         _save(figure, path)
 
 
-NAMES = {HERE: "turgor", BOX2D: "Box2D 2.3", "box2d-ccd": "Box2D 2.3 with CCD", "box2d-v3": "Box2D v3"}
+def name_of(engine: str) -> str:
+    """What an engine is called."""
+    return engine if engine == HERE else ENGINES[engine].says
 
 
 def _legend(figure: Any, engines: Sequence[str], *, floor: bool, box2d: str = "") -> None:
@@ -112,7 +116,7 @@ def _legend(figure: Any, engines: Sequence[str], *, floor: bool, box2d: str = ""
     for engine in engines:
         colour, marker = LOOKS[engine]
         shape: dict[str, Any] = {"linestyle": "-"} if floor else {"linestyle": "", "marker": marker}
-        handles.append(Line2D([], [], color=colour, label=NAMES[engine], **shape))
+        handles.append(Line2D([], [], color=colour, label=name_of(engine), **shape))
     if floor:
         handles.append(Line2D([], [], color=GREY, label="Box2D 2.3, start moved by 1e-6 m"))
     if box2d:
