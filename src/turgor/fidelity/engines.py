@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from turgor.control import check_theta
-from turgor.errors import InvalidInput, describe, one_of
+from turgor.errors import InvalidInput, WorkLost, describe, one_of
 from turgor.experiments.campaign import follow_first_process
 from turgor.fidelity.drive import Ended, Trace, World, new_trace, run
 from turgor.recording import Recording
 from turgor.rollout import Rollout, cut_evenly, judge, starts_of
-from turgor.simulate import available_cores
+from turgor.simulate import MOST_THREADS, available_cores
 from turgor.task import Task
 
 MOST_TOGETHER = 16  # agents in lockstep: more gain nothing, and Box2D v3 has room for 128 worlds in a process
@@ -66,6 +66,11 @@ def installed() -> list[str]:
     return [engine for engine in ENGINES if is_there(engine)]
 
 
+def check_engine(engine: str, task: Task) -> None:
+    """Raises `InvalidInput` where `load_world` does, and for a task that `engine` has no counterpart of."""
+    load_world(engine)(task, task.position).close()
+
+
 def version_of(engine: str) -> str:
     """The package that `engine` comes with, and its version."""
     package = ENGINES[engine].package
@@ -97,7 +102,7 @@ def make_job(
 ) -> Job:
     """Agents with `theta` [agent, parameter], from the task's start or from `position` [m], shape [agent, mass, 2].
     Raises `InvalidInput` for other shapes, and for what `engine` cannot do."""
-    load_world(engine)
+    check_engine(engine, task)
     theta = check_theta(theta, task.body, task.condition, task.controller)
     return Job(engine, task, theta, starts_of(task, len(theta), position), record)
 
@@ -108,8 +113,8 @@ class Crew:
 
     def __init__(self, processes: int | None = None) -> None:
         """`processes`: None for all cores. Raises `InvalidInput` for fewer than 1."""
-        if processes is not None and (not isinstance(processes, int) or processes < 1):
-            raise InvalidInput("processes: expected a whole number, at least 1", describe(processes))
+        if processes is not None and (not isinstance(processes, int) or not 1 <= processes <= MOST_THREADS):
+            raise InvalidInput(f"processes: expected a whole number, 1 to {MOST_THREADS}", describe(processes))
         self.processes = processes or available_cores()
         self._pool: Executor
 
@@ -136,7 +141,9 @@ class Crew:
                         progress(sum(n for future, n in agents.items() if future.done()), sum(agents.values()))
                 yield _joined(job, [future.result() for future, _ in parts])
         except BrokenProcessPool:
-            raise InvalidInput("crosscheck: expected its processes to go on; one was ended from outside") from None
+            raise WorkLost(
+                "crosscheck: expected its processes to go on; one was ended from outside (memory?)"
+            ) from None
         finally:
             for future in agents:
                 future.cancel()
