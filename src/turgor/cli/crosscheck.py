@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from turgor.cli.command import Command, Interrupted, Parser, count, whole
 from turgor.cli.progress import CrosscheckDisplay
@@ -35,8 +34,8 @@ def _options(parser: Parser) -> None:
         "--engines",
         nargs="+",
         metavar="NAME",
-        help="box2d (2.3, the paper's), box2d-ccd (the same with continuous collision), box2d-v3 (default: box2d and "
-        "box2d-v3, where they are installed)",
+        help="box2d (2.3, the paper's), box2d-ccd (the same with continuous collision), box2d-fine (in quarter steps), "
+        "box2d-v3 (default: box2d and box2d-v3, where they are installed)",
     )
     add("--seed", type=whole, metavar="N", help="draws the controllers (default: 0)")
     add("--threads", type=count, metavar="N", help="cores to use (default: all)")
@@ -217,12 +216,13 @@ def _suite(options: argparse.Namespace) -> None:
             "--suite: expected no RUN beside it; --campaign FOLDER says whose champions", str(options.path)
         )
     _refuse(options, ["controllers", "engines", "seed", "json", "check", "no_replay"], "expected without --suite")
-    suite: Any = import_module("turgor.fidelity.suite")
+    from turgor.fidelity.suite import write_suite
+
     campaign, out = options.campaign or Path("runs/paper"), options.out or SUITE
     try:
         with CrosscheckDisplay() as display:
-            page = suite.write_suite(
-                out, campaign=campaign, golden=None, processes=options.threads, say=display.say, progress=display.tick
+            page = write_suite(
+                out, campaign=campaign, processes=options.threads, say=display.say, progress=display.tick
             )
     except KeyboardInterrupt:
         raise Interrupted(f"the same command begins again, in {out}") from None

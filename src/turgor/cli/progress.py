@@ -104,19 +104,29 @@ class CrosscheckDisplay(Display):
     """Shows the `Progress` of crosschecks: a bar on a terminal, above it a line for each run of a campaign that is
     finished; in a pipe these lines, and of a single run a line now and then."""
 
+    def tick(self, done: int, total: int) -> None:
+        """Shows a share of what is under way, of which nobody knows how long it takes."""
+        self._show(done / max(total, 1), f"{done:,} of {total:,}")
+
     def __call__(self, progress: Crosschecks) -> None:
-        several = progress.total > 1
         left = "" if progress.seconds_left is None else f"  {_clock(progress.seconds_left)} left"
-        if progress.finished is not None and several:
+        if progress.total == 1:
+            self._show(progress.share, f"{progress.share:.0%}{left}")
+            return
+        if progress.finished is not None:
             verdicts = "; ".join(str(c.verdict) for c in progress.finished.comparisons)
             text = f"[{progress.done}/{progress.total}] {progress.finished.subject.run}  {verdicts}"
             self.say(text if self._bars is not None else text + left)
-        text = f"{progress.done} of {progress.total} runs" if several else f"{progress.share:.0%}"
         if self._bars is not None:
-            self._bars.update(self._whole, completed=progress.share, total=1.0, description=text + left)
+            self._show(progress.share, f"{progress.done} of {progress.total} runs{left}")
+
+    def _show(self, share: float, text: str) -> None:
+        """Brings the bar up to date; in a pipe, says so now and then."""
+        if self._bars is not None:
+            self._bars.update(self._whole, completed=share, total=1.0, description=text)
             self._bars.refresh()
-        elif not several and time.monotonic() - self._shown > LINE_INTERVAL:
-            self.say(text + left)
+        elif time.monotonic() - self._shown > LINE_INTERVAL:
+            self.say(text)
             self._shown = time.monotonic()
 
 

@@ -27,6 +27,7 @@ class Box2DWorld:
     """One agent's body and scene in Box2D 2.3; see `turgor.fidelity.drive.World`."""
 
     continuous = False  # collision: fast squares are stopped where they first touch the scene
+    substeps = 1  # of a step, under the same forces and lengths
 
     def __init__(self, task: Task, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
         check_task(task)
@@ -36,6 +37,7 @@ class Box2DWorld:
             gravity=(0, -task.physics.gravity), doSleep=False, contactListener=self.touches, continuousPhysics=False
         )
         self.world.continuousPhysics, self.world.warmStarting = self.continuous, True
+        self.world.autoClearForces = False
         _add_scene(self.world, task)
         self.masses = _add_masses(self.world, task, position, velocity)
         self.springs = _add_springs(self.world, task, self.masses)
@@ -53,7 +55,11 @@ class Box2DWorld:
             spring.length = length
         for mass, push in zip(self.masses, force.tolist(), strict=True):
             mass.ApplyForceToCenter(push, True)
-        self.world.Step(self.physics.dt, self.physics.velocity_iterations, self.physics.position_iterations)
+        for _ in range(self.substeps):
+            self.world.Step(
+                self.physics.dt / self.substeps, self.physics.velocity_iterations, self.physics.position_iterations
+            )
+        self.world.ClearForces()
 
     def close(self) -> None:
         self.positions, self.velocities = [], []
@@ -65,6 +71,12 @@ class ContinuousBox2DWorld(Box2DWorld):
     """The same with continuous collision on: Box2D's default, and the paper's program."""
 
     continuous = True
+
+
+class FineBox2DWorld(Box2DWorld):
+    """The same in steps of a quarter of the length, while controller and gas keep theirs: what hangs on the step."""
+
+    substeps = 4
 
 
 class _Touches(Box2D.b2ContactListener):

@@ -28,7 +28,7 @@ from turgor.simulate import Simulator, perturbed
 from turgor.task import Task
 
 HERE = "turgor"
-UNUSUAL = ("box2d-ccd",)  # compared with where asked for
+UNUSUAL = ("box2d-ccd", "box2d-fine")  # compared with where asked for
 CONTROLLERS = 60  # drawn at random, to be ranked, with numbers uniform in [-1, 1]
 MOST_REPEATS = 10_000
 APART = 0.01  # [m], between two positions of a mass: there the trajectories part
@@ -118,10 +118,10 @@ def crosscheck(
 
     In every engine it runs from `repeats` starts moved by 1e-6 m, and `controllers` run from the task's own, to be
     ranked: so many, drawn at random by `seed`, or those of an array [controller, parameter]. `engines` are some of
-    "box2d" (2.3, the paper's), "box2d-ccd" (the same with continuous collision, as the paper's program had it) and
-    "box2d-v3"; None: the first and the last, where they are installed. `processes`: None for all cores; then a script
-    has to be guarded by `if __name__ == "__main__"`. The numbers do not depend on it. `progress` is called with the
-    agents that are done and with all.
+    "box2d" (2.3, the paper's), "box2d-ccd" (the same with continuous collision, as the paper's program had it),
+    "box2d-fine" (in steps of a quarter of the length) and "box2d-v3"; None: the first and the last, where installed.
+    `processes`: None for all cores; then a script has to be guarded by `if __name__ == "__main__"`. The numbers do not
+    depend on it. `progress` is called with the agents that are done and with all.
 
     Raises `InvalidInput` for impossible numbers, and for an engine that is not installed or cannot do the task.
     """

@@ -37,6 +37,7 @@ class Engine(NamedTuple):
 ENGINES = {
     "box2d": Engine("Box2D 2.3", "turgor.fidelity.box2d", "Box2DWorld", "box2d"),
     "box2d-ccd": Engine("Box2D 2.3 with CCD", "turgor.fidelity.box2d", "ContinuousBox2DWorld", "box2d"),
+    "box2d-fine": Engine("Box2D 2.3, 4 steps in one", "turgor.fidelity.box2d", "FineBox2DWorld", "box2d"),
     "box2d-v3": Engine("Box2D v3", "turgor.fidelity.box2d_v3", "Box2Dv3World", "pyb2d3"),
 }
 

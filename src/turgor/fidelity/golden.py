@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -171,8 +171,8 @@ def replay_in(engine: str, case: Case) -> tuple[np.ndarray, np.ndarray]:
 # --- rows ---------------------------------------------------------------------------------------------------------
 
 
-def growth_rows(engine: str, folder: Path, tick: Callable[[], object]) -> list[Growth]:
-    """Error growth of every open-loop case in `engine`; `tick` is called after each."""
+def growth_rows(engine: str, folder: Path) -> list[Growth]:
+    """Error growth of every open-loop case in `engine`."""
     rows = []
     for case in open_loop_cases(folder):
         position, _ = replay_in(engine, case)
@@ -183,11 +183,10 @@ def growth_rows(engine: str, folder: Path, tick: Callable[[], object]) -> list[G
             for k, step in enumerate(case.frames)
             if step and step % CURVE == 0
         ]
-        tick()
     return rows
 
 
-def square_rows(engine: str, folder: Path, tick: Callable[[], object]) -> list[Square]:
+def square_rows(engine: str, folder: Path) -> list[Square]:
     """Largest errors of every case of single squares in `engine`."""
     rows = []
     for case in square_cases(folder):
@@ -202,11 +201,10 @@ def square_rows(engine: str, folder: Path, tick: Callable[[], object]) -> list[S
                 velocity=float(error[..., 2:].max()),
             )
         )
-    tick()
     return rows
 
 
-def inflation_rows(engine: str, folder: Path, tick: Callable[[], object]) -> list[Inflation]:
+def inflation_rows(engine: str, folder: Path) -> list[Inflation]:
     """Area while the bodies are inflated on a plane, in `engine`."""
     rows, arrays = [], read_file(folder, "2_gas_law")
     for size, body in BODIES.items():
@@ -232,5 +230,4 @@ def inflation_rows(engine: str, folder: Path, tick: Callable[[], object]) -> lis
         means = np.array([rho[w + 1 : w + 61].mean() for w in of["window_start"]])
         error = np.abs(means - of["window_mean"])
         rows.append(Inflation(body=size, engine=engine, worst=float(error.max()), median=float(np.median(error))))
-    tick()
     return rows
