@@ -118,9 +118,8 @@ def _tell(record: Record) -> None:
     parts = [first.parts_floor, *(c.parts for c in record.comparisons)]
     after = ["never" if step is None else f"{step * dt:.2f} s" for step in parts]
     lines.append(["1 cm apart", f"{after[0]} (itself)", *after[1:]])
-    say(
-        f"{subject.title}: champion of generation {subject.generation}, from {record.settings.repeats} starts moved by 1e-6 m"
-    )
+    starts = f"{record.settings.repeats} starts moved by 1e-6 m"
+    say(f"{subject.title}: champion of generation {subject.generation}, from {starts}")
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in lines:
         say("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
@@ -178,9 +177,9 @@ def _summed_up(summary: Summary) -> str:
         "stronger": summary.stronger,
         "mixed": summary.mixed,
         "weaker": summary.weaker,
-        "do not hold": summary.not_held,
+        "does not hold": summary.not_held,
     }
-    verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.items() if n)
+    verdicts = ", ".join(f"{verdict} {n}" for verdict, n in counts.items() if n)
     text = f"{summary.task}, {name_of(summary.engine)}: {summary.hold} of {summary.champions} hold ({verdicts})"
     if summary.kept is not None:
         text += f"; median kept {summary.kept:.0%}"
@@ -188,9 +187,7 @@ def _summed_up(summary: Summary) -> str:
         text += f"; ranks {summary.rank:.2f}"
     if summary.solved is not None:
         text += f"; solved {summary.solved} of {summary.starts} starts, here {summary.solved_here}"
-    if summary.worst_kept is not None:
-        text += f"; worst {summary.worst}, keeps {summary.worst_kept:.0%}"
-    return text
+    return f"{text}; worst {summary.worst}, {summary.worst_there:.3g} there, {summary.worst_here:.3g} here"
 
 
 def _write_json(options: argparse.Namespace, found: Record | Found) -> None:
@@ -230,7 +227,7 @@ def _suite(options: argparse.Namespace) -> None:
 
 
 CROSSCHECK = Command(
-    "Run champions in real Box2D as well: is there as much to them there?",
+    "Run champions in real Box2D: are they worth as much there?",
     "examples:\n"
     "  turgor crosscheck runs/hilly-small-pressure-s0\n"
     "  turgor crosscheck runs/hilly-small-pressure-s0 --engines box2d box2d-ccd --repeats 100\n"

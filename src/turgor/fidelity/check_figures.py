@@ -128,8 +128,8 @@ def _draw_course(record: Record, recordings: Mapping[str, Recording], axes: Any)
     for engine, recording in recordings.items():
         look, step = LOOKS[engine], parts[engine]
         line: dict[str, Any] = {"color": look.colour, "linestyle": look.line}
-        after = "never 1 cm apart" if step is None else f"1 cm apart after {step * dt:.2f} s"
-        name = f"{name_of(engine)}, {'from a moved start ' if engine == HERE else ''}{after}"
+        when = "never" if step is None else f"after {step * dt:.2f} s"
+        name = f"{name_of(engine)}, 1 cm from {'itself, start moved,' if engine == HERE else HERE} {when}"
         axes.plot(recording.time, recording.com[:, 0], label=name, **line)
         if step is not None:
             axes.axvline(step * dt, linewidth=0.9, zorder=1, label="_1 cm apart", **line)
@@ -198,9 +198,9 @@ def draw_campaign(rows: Sequence[Row], summaries: Sequence[Summary]) -> Drawing:
                 mine = [row for row in rows if (row.task, row.engine) == (task, engine)]
                 summary = next(s for s in summaries if (s.task, s.engine) == (task, engine))
                 _draw_medians(mine, summary, axes)
-            line[0].set_ylabel(f"{name_of(engine)} [m/s]")
+            line[0].set_ylabel(f"median in {name_of(engine)}")
         for axes in panels[-1, : len(tasks)]:
-            axes.set_xlabel("turgor [m/s]")
+            axes.set_xlabel("median in turgor")
         _add_bodies(rows, figure)
     caption = (
         f"Every champion's median fitness over {rows[0].repeats} starts moved by 1e-6 m, there against here, with its "

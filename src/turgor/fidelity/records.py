@@ -159,8 +159,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     solved_here: int | None  # moved starts of all champions
     solved: int | None
     starts: int  # of champions of a task with an end
-    worst: str  # run that keeps least; empty: none has a median above 0 here
-    worst_kept: float | None
+    worst: str  # run whose median falls by most
+    worst_here: float  # its median here
+    worst_there: float
 
 
 def rows_of(record: Record) -> list[Row]:
@@ -198,15 +199,16 @@ def quartiles(sample: Sample) -> tuple[float, float]:
 def summarise(rows: Sequence[Row]) -> list[Summary]:
     """A summary of every task in every engine, and of all tasks where there are several."""
     tasks, engines = (sorted({getattr(row, name) for row in rows}) for name in ("task", "engine"))
-    found = [_summary(task, engine, rows) for task in tasks for engine in engines]
-    return found + ([_summary(ALL, engine, rows) for engine in engines] if len(tasks) > 1 else [])
+    cells = [(task, engine) for task in tasks + ([ALL] if len(tasks) > 1 else []) for engine in engines]
+    return [
+        _summary(*cell, [row for row in rows if row.engine == cell[1] and cell[0] in (row.task, ALL)]) for cell in cells
+    ]
 
 
-def _summary(task: str, engine: str, rows: Sequence[Row]) -> Summary:
-    mine = [row for row in rows if row.engine == engine and task in (row.task, ALL)]
+def _summary(task: str, engine: str, mine: Sequence[Row]) -> Summary:
     verdicts: list[Any] = [row.verdict for row in mine]
-    kept = [(row.kept, row.run) for row in mine if row.kept is not None]
-    worst_kept, worst = min(kept, default=(None, ""))
+    kept = [row.kept for row in mine if row.kept is not None]
+    worst = min(mine, key=lambda row: row.difference)
 
     def count(*names: Verdict) -> int:
         return sum(verdict in names for verdict in verdicts)
@@ -226,11 +228,12 @@ def _summary(task: str, engine: str, rows: Sequence[Row]) -> Summary:
         mixed=count("mixed"),
         weaker=count("weaker"),
         not_held=count("does not hold"),
-        kept=float(np.median([k for k, _ in kept])) if kept else None,
+        kept=float(np.median(kept)) if kept else None,
         rank=rank_correlation([row.median_here for row in mine], [row.median for row in mine]),
         solved_here=solved("solved_here"),
         solved=solved("solved"),
         starts=sum(row.repeats for row in mine if row.solved is not None),
-        worst=worst,
-        worst_kept=worst_kept,
+        worst=worst.run,
+        worst_here=worst.median_here,
+        worst_there=worst.median,
     )
