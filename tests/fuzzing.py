@@ -852,6 +852,7 @@ CHEAP: dict[str, list[str]] = {
     # those that would go on for long have something that is refused
     "view": ["nothing-there", "--no-browser"],
     "reproduce": ["--body", "tiny", "--out", "campaign"],
+    "crosscheck": ["run", "--engines", "nothing", "--out", "crossed"],
     "bench": ["--only", "nothing"],
 }  # fmt: skip
 
@@ -863,7 +864,7 @@ def make_command(random: Random) -> bytes:
     for _ in range(random.choice((1, 1, 2, 3))):
         what = random.random()
         option = random.choice(options_of(name))
-        words = PATHS if option in ("--out", "--json", "--csv", "--gallery") else WORDS
+        words = PATHS if option in ("--out", "--json", "--csv", "--gallery", "--campaign") else WORDS
         words = REFUSED_NUMBERS if option in LASTING else words
         value = random.choice(words)
         if what < 0.6:
@@ -874,7 +875,7 @@ def make_command(random: Random) -> bytes:
                 argv += [option, value]
             else:
                 argv.append(f"{option}={value}")
-        elif what < 0.7 and name in ("resume", "evaluate", "video", "export"):
+        elif what < 0.7 and name in ("resume", "evaluate", "video", "export", "crosscheck"):
             argv[1] = random.choice(PATHS)
         elif what < 0.8 and name not in ("view", "reproduce", "bench"):
             argv.insert(random.randrange(1, len(argv) + 1), random.choice(REFUSED_NUMBERS))

@@ -79,8 +79,8 @@ def crosscheck_run(
 ) -> Record:
     """The `Record` of the champion of the run in the folder `path`, written with figure and replay to `out`, by default
     PATH/crosscheck. The other arguments are those of `crosscheck`. Raises `InvalidInput`."""
-    names, run = engines_for(engines), Run.open(path)
-    champion = run.checked_champion()
+    run = Run.open(path)
+    champion, names = run.checked_champion(), engines_for(engines)
     case = Case(run.task, champion.theta, controllers_for(run.task, controllers, seed))
     out = path / FOLDER if out is None else out
     settings = Settings(repeats=repeats, controllers=len(case.ranked), seed=seed, engines=names)
