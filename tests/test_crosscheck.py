@@ -26,6 +26,7 @@ from turgor.experiments.rows import read_rows
 from turgor.experiments.statistics import median_difference
 from turgor.fidelity import compare, engines
 from turgor.fidelity.campaign import crosscheck_campaign, crosscheck_run
+from turgor.fidelity.check_figures import draw_run
 from turgor.fidelity.compare import Sample, Verdict, crosscheck, kolmogorov_smirnov, rank_correlation
 from turgor.fidelity.drive import new_trace, run
 from turgor.fidelity.engines import Crew, make_job
@@ -415,6 +416,27 @@ def test_crosscheck_of_a_run(here: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert (record.samples, record.comparisons) == (again.samples, again.comparisons)
 
 
+def test_the_figure_of_a_run_shows_every_start_and_where_trajectories_part(here: Path, tmp_path: Path) -> None:
+    names, path = ["box2d", "box2d-ccd"], here / "runs" / "deep" / "escape"
+    record = crosscheck_run(path, tmp_path / "out", repeats=6, controllers=4, engines=names, processes=1)
+    run = Run.open(path)
+    found = crosscheck(run.task, run.checked_champion().theta, 6, controllers=4, engines=names)
+    fitness, ranks, course, paths = draw_run(record, run.task.scene, found.recordings).figure.axes
+    shown = {line.get_label(): line for line in fitness.lines}
+    for sample in record.samples:
+        assert shown[f"{sample.engine}, starts"].get_xdata().tolist() == sample.fitness
+        assert shown[f"{sample.engine}, own start"].get_xdata().tolist() == [sample.own]
+    assert [line.get_ydata().tolist() for line in ranks.lines[:2]] == [s.ranked for s in record.samples[1:]]
+    parts = [record.comparisons[0].parts_floor, *(c.parts for c in record.comparisons)]
+    marks = [line.get_xdata()[0] for line in course.lines if line.get_label() == "_1 cm apart"]
+    assert marks == pytest.approx([step / 60 for step in parts if step is not None])
+    assert len(marks) >= 1
+    colours = [{line.get_color() for line in axes.lines if line.get_label().startswith("Box2D 2.3 with CCD")}
+               for axes in (course, paths)]  # fmt: skip
+    assert colours[0] == colours[1] == {"#D55E00"}
+    check_picture(tmp_path / "out" / "crosscheck.png")
+
+
 def test_what_an_earlier_crosscheck_left_is_not_kept(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = here / "elsewhere" / "deep"
     argv = ["crosscheck", "runs/deep/escape", *SHORT, "--controllers", "0", "--out", str(out)]
@@ -424,8 +446,11 @@ def test_what_an_earlier_crosscheck_left_is_not_kept(here: Path, capsys: pytest.
     assert "ranks" not in told
     assert (out / "replay.html").exists()
     assert main([*argv, "--no-replay", "--json", "-"]) == 0
-    assert not (out / "replay.html").exists()
     found = json.loads(capsys.readouterr().out)  # and nothing else
+    assert not (out / "replay.html").exists()
+    (here / "replay.html").write_text("of something else")
+    assert main([*argv[:-1], ".", "--no-replay"]) == 0
+    assert (here / "replay.html").read_text() == "of something else"
     assert found["subject"]["task"] == "escape"
     assert names_in(here / "runs" / "deep" / "escape") == names_in(here / "runs" / "hilly-0")  # written elsewhere
 
@@ -441,7 +466,7 @@ def test_check_tells_by_the_exit_status(here: Path) -> None:
 
 
 def test_a_pipe_gets_plain_lines(here: Path) -> None:
-    process = turgor_process("crosscheck", "runs/hilly-0", "--repeats", "4", "--controllers", "4", "--threads", "2")
+    process = turgor_process("crosscheck", "runs/hilly-0", *SHORT, "--threads", "2")
     out, err = process.communicate(timeout=120)
     assert (process.returncode, complaints(err)) == (0, [])
     assert "\x1b" not in out
@@ -605,6 +630,10 @@ def test_the_folder_disturbs_nothing(here: Path, capsys: pytest.CaptureFixture[s
         (["runs", "--seed", "1"], "--seed: expected of a single run"),
         (["runs/hilly-0", "--suite"], "--suite: expected no RUN beside it"),
         (["--suite", "--engines", "box2d"], "--engines: expected without --suite"),
+        (
+            ["--suite", "--campaign", "empty"],
+            "empty: expected a campaign; turgor reproduce makes one; got no champions",
+        ),
     ],
 )
 def test_errors_are_one_line(argv: list[str], text: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -43,8 +43,12 @@ def _options(parser: Parser) -> None:
     add("--no-replay", action="store_true", help="do not write replay.html, both engines side by side")
     add("--check", action="store_true", help="exit status 1 unless the run holds in every engine")
     add("--out", type=Path, metavar="FOLDER", help="for what is found (default: crosscheck in RUN)")
-    add("--suite", action="store_true", help="in place of a run: the golden data, contacts, random controllers and a "
-        "campaign's champions in every engine, as a report")  # fmt: skip
+    add(
+        "--suite",
+        action="store_true",
+        help="in place of a run: golden data, contacts, random controllers and a campaign's champions in every engine, "
+        "as a report (default of --out: results/fidelity)",
+    )
     add("--campaign", type=Path, metavar="FOLDER", help="with --suite: whose champions (default: runs/paper)")
 
 

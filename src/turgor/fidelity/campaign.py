@@ -47,6 +47,7 @@ from turgor.web.export import export_replays
 from turgor.web.replay import facts_of_run, replay_of_recording
 
 FOLDER = "crosscheck"  # in a run's or a campaign's
+RESULT = "crosscheck.json"
 
 
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
@@ -88,13 +89,14 @@ def crosscheck_run(
         clock = _Clock([case.task], progress)
         found = next(crosschecks([case], repeats, names, crew, clock.tick))
         record = _record(subject_of(run, path.resolve().name), settings, found)
-        write_record(out / "crosscheck.json", record)
+        again = (out / RESULT).exists()
+        write_record(out / RESULT, record)
         write_drawing(draw_run(record, run.task.scene, found.recordings), out)
         if replay:
             write_whole(out / "replay.html", _side_by_side(run, record, found).encode())
-        else:
+        elif again:  # it may be an earlier champion's
             with writing(out / "replay.html"):
-                (out / "replay.html").unlink(missing_ok=True)  # of an earlier champion, it may be
+                (out / "replay.html").unlink(missing_ok=True)
         clock.finish(record)
     return record
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module, metadata
+from multiprocessing.connection import Connection
+from types import TracebackType
 from typing import Any, NamedTuple
 
 import msgspec
@@ -113,22 +118,30 @@ class Crew:
     spawned, and then a script has to be guarded by `if __name__ == "__main__"`."""
 
     def __init__(self, processes: int | None = None) -> None:
-        """`processes`: None for all cores. Raises `InvalidInput` for fewer than 1."""
+        """`processes`: None for all cores. Raises `InvalidInput` for fewer than 1, or more than any machine has."""
         if processes is not None and (not isinstance(processes, int) or not 1 <= processes <= MOST_THREADS):
             raise InvalidInput(f"processes: expected a whole number, 1 to {MOST_THREADS}", describe(processes))
         self.processes = processes or available_cores()
         self._pool: Executor
+        self._end: Connection | None = None  # of a pipe: processes end where its other end is closed
+        self._open: Connection | None = None
 
     def __enter__(self) -> Crew:
         if self.processes == 1:
             self._pool = ThreadPoolExecutor(1)
         else:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.processes, context, follow_first_process)
+            self._end, self._open = context.Pipe(duplex=False)
+            self._pool = ProcessPoolExecutor(self.processes, context, _begin, (self._end,))
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if error is not None and self._open is not None:
+            self._open.close()  # as Ctrl-C: what is in hand is of no use any more
         self._pool.shutdown(cancel_futures=True)
+        for end in (self._end, self._open):
+            if end is not None:
+                end.close()
 
     def run(self, jobs: Sequence[Job], progress: Callable[[int, int], object] | None = None) -> Iterator[Done]:
         """What came of each of `jobs`, in their order, as soon as it is known. `progress` is called with the agents
@@ -159,6 +172,18 @@ class Crew:
         """One for every process, as long as they are not too large."""
         agents = len(job.theta)
         return cut_evenly(agents, max(min(self.processes, agents), -(-agents // MOST_TOGETHER)))
+
+
+def _begin(end: Connection) -> None:
+    """Ends this process where the first one is gone, or has closed the other end of the pipe."""
+    follow_first_process()
+
+    def wait() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            end.recv()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _work(engine: str, task: Task, theta: np.ndarray, starts: np.ndarray, record: bool) -> tuple[Ended, Trace | None]:
