@@ -20,11 +20,11 @@ import turgor
 from turgor.body import SMALL, Body
 from turgor.cli import main
 from turgor.control import MLP, Distributed, Sinusoid
-from turgor.errors import InvalidInput
+from turgor.errors import InvalidInput, WorkLost
 from turgor.evolution.loop import evolve
 from turgor.experiments.rows import read_rows
 from turgor.experiments.statistics import median_difference
-from turgor.fidelity import compare, engines
+from turgor.fidelity import compare
 from turgor.fidelity.campaign import crosscheck_campaign, crosscheck_run
 from turgor.fidelity.check_figures import draw_run
 from turgor.fidelity.compare import Sample, Verdict, crosscheck, kolmogorov_smirnov, rank_correlation
@@ -314,28 +314,14 @@ def test_an_engine_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_process_that_is_ended_is_told() -> None:
+    short, long = (make_job("box2d", make_task("hilly", steps=n), np.zeros((4, len(THETA)))) for n in (5, 5000))
     with Crew(2) as crew:
-        jobs = [make_job("box2d", make_task("hilly", steps=600), np.zeros((4, FLAT.parameter_count)))]
-        answers = crew.run(jobs, lambda *_: None)
-        killer = _kill_soon(crew)
-        with pytest.raises(engines.WorkLost, match="one was ended from outside"):
-            next(answers)
-        killer.join()
-
-
-def _kill_soon(crew: Crew) -> Any:
-    import threading
-
-    def kill() -> None:
+        answers = crew.run([short, long])
+        next(answers)
         pool: Any = crew._pool
-        deadline = time.monotonic() + 30
-        while not getattr(pool, "_processes", None) and time.monotonic() < deadline:
-            time.sleep(0.01)
         next(iter(pool._processes.values())).kill()
-
-    thread = threading.Thread(target=kill)
-    thread.start()
-    return thread
+        with pytest.raises(WorkLost, match="one was ended from outside"):
+            next(answers)
 
 
 # --- the command --------------------------------------------------------------------------------------------------

@@ -189,7 +189,7 @@ def draw_campaign(rows: Sequence[Row], summaries: Sequence[Summary]) -> Drawing:
     tasks, engines = (sorted({getattr(row, name) for row in rows}) for name in ("task", "engine"))
     wide = (WIDTH - 0.3) / max(len(tasks), 2)
     with paper_style():
-        figure = make_sheet((wide + 0.35) * len(engines) + 0.3)
+        figure = make_sheet((wide + 0.5) * len(engines) + 0.3)
         panels = figure.subplots(len(engines), max(len(tasks), 2), squeeze=False)
         for axes in panels[:, len(tasks) :].flat:
             axes.set_axis_off()
@@ -216,16 +216,16 @@ def _draw_medians(rows: Sequence[Row], summary: Summary, axes: Any) -> None:
         return
     for row in rows:
         x, y, colour = row.median_here, row.median, LOOKS[row.engine].colour
-        line: dict[str, Any] = {"color": colour, "linewidth": 0.6, "alpha": 0.6, "label": f"_{row.run}"}
+        line: dict[str, Any] = {"color": colour, "linewidth": 0.6, "alpha": 0.4, "label": f"_{row.run}"}
         axes.plot([row.lower_here, row.upper_here], [y, y], **line)
         axes.plot([x, x], [row.lower, row.upper], **line)
-        holds = row.verdict in HOLDS
-        dot: dict[str, Any] = {"mec": colour, "mfc": colour if holds else "white", "mew": 0.9, "ms": 4.2, "zorder": 3}
+        edge, face = ("white", colour) if row.verdict in HOLDS else (colour, "white")
+        dot: dict[str, Any] = {"mec": edge, "mfc": face, "mew": 0.5 if face == colour else 0.9, "ms": 4.2, "zorder": 3}
         axes.plot([x], [y], _body_look(row.body).marker, label=row.run, **dot)
     _add_diagonal(axes, [v for r in rows for v in (r.lower_here, r.upper_here, r.lower, r.upper)])
     axes.set_aspect("equal")
     rank = "" if summary.rank is None else f", ranks {summary.rank:.2f}"
-    axes.set_title(f"{summary.task}: {summary.hold} of {summary.champions} hold{rank}", loc="left")
+    axes.set_title(f"{summary.task}\n{summary.hold} of {summary.champions} hold{rank}", loc="left")
 
 
 def _body_look(body: str) -> Look:

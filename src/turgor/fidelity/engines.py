@@ -146,18 +146,18 @@ class Crew:
     def run(self, jobs: Sequence[Job], progress: Callable[[int, int], object] | None = None) -> Iterator[Done]:
         """What came of each of `jobs`, in their order, as soon as it is known. `progress` is called with the agents
         that are done and with all, whenever some are done."""
-        futures = [[self._submit(job, part) for part in self._parts(job)] for job in jobs]
-        agents = {future: part.stop - part.start for job in futures for future, part in job}
+        agents: dict[Future[tuple[Ended, Trace | None]], int] = {}
         try:
+            futures = [[self._submit(job, part) for part in self._parts(job)] for job in jobs]
+            agents |= {future: part.stop - part.start for job in futures for future, part in job}
             for job, parts in zip(jobs, futures, strict=True):
                 for _ in as_completed([future for future, _ in parts]):
                     if progress is not None:
                         progress(sum(n for future, n in agents.items() if future.done()), sum(agents.values()))
                 yield _joined(job, [future.result() for future, _ in parts])
         except BrokenProcessPool:
-            raise WorkLost(
-                "crosscheck: expected its processes to go on; one was ended from outside (memory?)"
-            ) from None
+            expected = "crosscheck: expected its processes to go on; one was ended from outside (memory?)"
+            raise WorkLost(expected) from None
         finally:
             for future in agents:
                 future.cancel()
