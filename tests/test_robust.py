@@ -33,6 +33,7 @@ from turgor.web.replay import read_replay, replay_of_run
 NONE = {"friction": 0.0, "gravity": 0.0, "gas": 0.0, "damping": 0.0, "shift": 0.0, "jitter": 0.0}
 QUICK = Robust(worlds=3)
 POPULATION = 21
+GRAVITY = 9.853673760439841  # [m/s^2], of the first world of seed 3, generation 4
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +82,17 @@ def test_worlds_depend_on_seed_and_generation_alone(task: Task) -> None:
     assert len(set(drawn)) == len(drawn)
     assert task.identity not in drawn
     assert ids(5, 7, worlds=9)[:3] == ids(5, 7)
+
+
+def test_worlds_are_drawn_as_runs_that_are_kept_were(task: Task) -> None:
+    """Another order of draws would make other worlds of an old run, whose champion could not be judged again."""
+    u = 2 * np.random.default_rng(np.random.SeedSequence(3, spawn_key=(4,))).random((2, 5 + 2 * 10)) - 1
+    for world, draw in zip(draw_worlds(task, Robust(worlds=2), 3, 4), u, strict=True):
+        found, own = numbers_of(world), numbers_of(task)
+        for name, spread, share in zip(own, (0.1, 0.02, 0.05, 0.2), draw[:4].tolist(), strict=True):
+            assert found[name] == own[name] * (1 + spread * share)
+        assert np.array_equal(world.position, task.position + [0.05 * draw[4], 0.0] + 1e-6 * draw[5:].reshape(10, 2))
+    assert numbers_of(draw_worlds(task, Robust(worlds=1), 3, 4)[0])["gravity"] == GRAVITY
 
 
 def test_numbers_are_uniform_within_their_spread(task: Task) -> None:

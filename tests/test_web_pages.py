@@ -210,7 +210,9 @@ def test_a_robust_run_says_what_its_fitness_is(browser: Browser, serve: Callable
     page.goto(f"{address}#/run/one")
     page.wait_for_selector(".curves path.line.best")
     assert "robust: median of 3 changed worlds" in page.inner_text("h1")
-    assert re.search(rf"fitness\s+\S+ m/s\s+{judged}, found in generation [12]", page.inner_text(".tiles"), re.IGNORECASE)
+    assert re.search(
+        rf"fitness\s+\S+ m/s\s+{judged}, found in generation [12]", page.inner_text(".tiles"), re.IGNORECASE
+    )
     assert f"the diamond is what it was chosen for: {judged}." in page.inner_text(".luck")
     assert str(page.locator(".luck path.mark title").text_content()).startswith(f"{judged}: ")
     page.get_by_text("Settings").click()
