@@ -4,45 +4,21 @@
 
 It is what a careful author would write without an engine of their own: everything that does not change is laid out
 once, positions and velocities are read through live views of Box2D's vectors, one force per mass, one NumPy product
-for the controller, a contact listener instead of lists of contacts. `turgor bench` runs it beside the engine, and
-the tests hold the two together over the first steps. Needs the package `box2d`.
+for the controller, a contact listener instead of lists of contacts. The world is that of `turgor.fidelity.box2d`, which
+runs any task; what is here does one kind of task, and that faster. `turgor bench` runs it beside the engine, and the
+tests hold the two together over the first steps. Needs the package `box2d`.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-import warnings
-from typing import Any
 
 import numpy as np
 
 from turgor.control import Linear, rows
-from turgor.task import Physics, Task, make_task
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # turned into an error, its DeprecationWarning would crash the interpreter
-    import Box2D
-
-
-class Touches(Box2D.b2ContactListener):
-    """How many things each mass touches; Box2D tells what changed, at the start of its step."""
-
-    def __init__(self, mass_count: int) -> None:
-        super().__init__()
-        self.count = [0] * mass_count
-
-    def BeginContact(self, contact: Any) -> None:
-        self._add(contact, 1)
-
-    def EndContact(self, contact: Any) -> None:
-        self._add(contact, -1)
-
-    def _add(self, contact: Any, change: int) -> None:
-        for fixture in (contact.fixtureA, contact.fixtureB):
-            mass = fixture.body.userData
-            if mass is not None:  # the ground
-                self.count[mass] += change
+from turgor.fidelity.box2d import Box2DWorld
+from turgor.task import Task, make_task
 
 
 class Agent:
@@ -52,13 +28,9 @@ class Agent:
         check_task(task)
         body, n = task.body, task.body.mass_count
         self.physics = task.physics
-        self.touches = Touches(n)
-        self.world = make_world(task, self.touches)
-        self.masses = add_masses(self.world, task)
-        self.springs = add_springs(self.world, task, self.masses)
-        # live views: they read Box2D's own numbers, and live as long as the world
-        self.position = [mass.position for mass in self.masses]
-        self.velocity = [mass.linearVelocity for mass in self.masses]
+        self.box2d = Box2DWorld(task, task.position)
+        self.world, self.masses, self.springs = self.box2d.world, self.box2d.masses, self.box2d.springs
+        self.position, self.velocity, self.touches = self.box2d.positions, self.box2d.velocities, self.box2d.touches
         self.share = body.mass / body.mass.sum()
 
         # observations: touch, x of all, y of all, velocity, pressure; theta has x and y of each mass together
@@ -90,6 +62,7 @@ class Agent:
         self.actuate(output)
         self.push(state[:2])
         self.world.Step(self.physics.dt, self.physics.velocity_iterations, self.physics.position_iterations)
+        self.world.ClearForces()
         self.steps += 1
 
     def read(self) -> np.ndarray:
@@ -131,65 +104,12 @@ class Agent:
 
 def check_task(task: Task) -> None:
     """Raises `ValueError` for a task that this program does not cover."""
-    alike = (
-        "dt",
-        "gravity",
-        "velocity_iterations",
-        "position_iterations",
-        "temperature",
-        "pressure_max",
-        "pressure_min",
-    )
-    fixed = {name: getattr(Physics(), name) for name in Physics.__struct_fields__ if name not in alike}
-    if any(getattr(task.physics, name) != value for name, value in fixed.items()):
-        raise ValueError("expected the `paper` preset: Box2D's own numbers cannot be changed")
     if task.controller != Linear():
         raise ValueError("expected a linear controller")
     if task.condition != "pressure" or task.body.chamber_count != 1 or task.end is not None:
         raise ValueError("expected one chamber under control, and a task without an end")
     if len(task.body.chambers[0]) != task.body.mass_count or task.sensing.observation != "signed":
         raise ValueError("expected all masses around the chamber, and signed observations")
-
-
-def make_world(task: Task, touches: Touches) -> Any:
-    """A world with the task's ground: an edge for every segment."""
-    world = Box2D.b2World(gravity=(0, -task.physics.gravity), doSleep=False, contactListener=touches)
-    world.continuousPhysics, world.warmStarting = False, True
-    ground = world.CreateStaticBody()
-    for x1, y1, x2, y2 in task.scene.segments.tolist():
-        edge = Box2D.b2EdgeShape(vertices=[(x1, y1), (x2, y2)])
-        ground.CreateFixture(shape=edge, friction=task.scene.friction, restitution=0)
-    return world
-
-
-def add_masses(world: Any, task: Task) -> list[Any]:
-    """The squares: turned by their angle, and never further."""
-    body, masses = task.body, []
-    for i, position in enumerate(task.position.tolist()):
-        mass = world.CreateDynamicBody(position=position, angle=float(body.angle[i]), fixedRotation=True, userData=i)
-        half, density = float(body.side[i]) / 2, float(body.density[i])
-        square = Box2D.b2PolygonShape(box=(half, half))
-        mass.CreateFixture(shape=square, density=density, friction=body.friction, restitution=0)
-        masses.append(mass)
-    return masses
-
-
-def add_springs(world: Any, task: Task, masses: list[Any]) -> list[Any]:
-    """The springs; what one joins does not collide."""
-    body, springs = task.body, []
-    for s, (i, j) in enumerate(body.springs.tolist()):
-        spring = world.CreateDistanceJoint(
-            bodyA=masses[i],
-            bodyB=masses[j],
-            anchorA=masses[i].worldCenter,
-            anchorB=masses[j].worldCenter,
-            length=float(body.rest_length[s]),
-            frequencyHz=float(body.frequency[s]),
-            dampingRatio=float(body.damping_ratio[s]),
-            collideConnected=False,
-        )
-        springs.append(spring)
-    return springs
 
 
 def rollout(task: Task, theta: np.ndarray) -> float:

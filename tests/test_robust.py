@@ -18,7 +18,7 @@ from turgor.cli import main
 from turgor.errors import InvalidInput
 from turgor.evolution.cma_es import CMAES
 from turgor.evolution.loop import Progress, begin, evaluate, evolve, evolve_a_while, resume
-from turgor.evolution.worlds import draw_worlds, judge, kept
+from turgor.evolution.worlds import draw_worlds, judge_generation, kept
 from turgor.experiments.campaign import open_run
 from turgor.experiments.plan import Entry
 from turgor.records import Checkpoint
@@ -274,7 +274,7 @@ def test_history_and_champion_are_what_the_drawn_worlds_say(keep: Any, task: Tas
     assert champion.fitness == max(best)
     assert champion.generation == np.argmax(best) + 1
     assert np.array_equal(champion.robust, evaluate(Simulator(task), champion.theta, 2).fitness)  # of the task's world
-    again = judge(Simulator(task), champion.theta[None], robust, 6, champion.generation)
+    again = judge_generation(Simulator(task), champion.theta[None], robust, 6, champion.generation)
     assert again.fitness[0] == champion.fitness
 
 

@@ -35,13 +35,14 @@ if TYPE_CHECKING:
     from turgor.evolution.strategy import Strategy as Strategy
     from turgor.evolution.worlds import draw_worlds as draw_worlds
     from turgor.experiments.reproduce import reproduce as reproduce
+    from turgor.fidelity.compare import crosscheck as crosscheck
     from turgor.recording import Recording as Recording
+    from turgor.rollout import Rollout as Rollout
     from turgor.runs import Run as Run
     from turgor.scene import Scene as Scene
     from turgor.scene import cage as cage
     from turgor.scene import flat as flat
     from turgor.scene import hills as hills
-    from turgor.simulate import Rollout as Rollout
     from turgor.simulate import Simulator as Simulator
     from turgor.simulate import Step as Step
     from turgor.simulate import perturbed as perturbed
@@ -67,10 +68,12 @@ _HOME = {
     "turgor.evolution.strategy": ("Degenerate", "Strategy"),
     "turgor.evolution.worlds": ("draw_worlds",),
     "turgor.experiments.reproduce": ("reproduce",),
+    "turgor.fidelity.compare": ("crosscheck",),
     "turgor.recording": ("Recording",),
     "turgor.runs": ("Run",),
+    "turgor.rollout": ("Rollout",),
     "turgor.scene": ("Scene", "cage", "flat", "hills"),
-    "turgor.simulate": ("Rollout", "Simulator", "Step", "perturbed", "replay"),
+    "turgor.simulate": ("Simulator", "Step", "perturbed", "replay"),
     "turgor.task": ("Leave", "Physics", "Task", "make_task", "resting"),
     "turgor.variants": ("Robust",),
 }

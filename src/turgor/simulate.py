@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -22,33 +21,13 @@ from turgor.physics.batch import Batch, World, load_kernel
 from turgor.physics.memory import BYTES, MOST_BYTES, MOST_TRACE_BYTES, check_memory
 from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH
 from turgor.recording import Recording
-from turgor.scene import LARGEST_COORDINATE, Scene
+from turgor.rollout import Rollout, cut_evenly, judge, starts_of
+from turgor.scene import Scene
 from turgor.task import Physics, Task, given_rows, start_position
 
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
-AGENTS_AT_ONCE = 4096  # whose final positions are looked at in float64
 MOST_THREADS = 1024
 LARGEST_PUSH = 1e9  # [m/s]
-
-
-class Rollout(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """What a batch of agents achieved; every field is per agent."""
-
-    fitness: Any  # [agent], see `Task.fitness`
-    steps: Any  # [agent], steps until the end
-    solved: Any  # [agent], bool: the end came before the time was up
-    com: Any  # [m], shape [agent, 2], final centre of mass
-    start: Any  # [m], shape [agent, 2], centre of mass at the start
-    position: Any  # [m], shape [agent, mass, 2], final
-
-    def __repr__(self) -> str:
-        if not np.isfinite(self.fitness).any():
-            return f"Rollout({len(self.fitness)} agents, none with a fitness)"
-        low, median, high = np.nanmin(self.fitness), np.nanmedian(self.fitness), np.nanmax(self.fitness)
-        return (
-            f"Rollout({len(self.fitness)} agents, fitness {low:.3f} to {high:.3f}, median {median:.3f}, "
-            f"{int(np.sum(self.solved))} solved)"
-        )
 
 
 class Step(msgspec.Struct, frozen=True, eq=False, kw_only=True):
@@ -119,12 +98,12 @@ class Simulator:
         [mass, 2]: the same steps that `rollout` takes."""
         theta = np.reshape(as_numbers("theta", theta), (1, -1))
         theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
-        starts = self._starts(1, None if position is None else as_numbers("position", position)[None])
+        starts = starts_of(self.task, 1, None if position is None else as_numbers("position", position)[None])
         batch = Batch(self._world, starts)
         batch.think(theta)
         trace = batch.trace(self.task.steps)
         final, steps, solved = self._run_whole(batch, trace)
-        out = self._judge(starts, final, steps, solved)
+        out = judge(self.task, starts, final, steps, solved)
         return _recording(self.task, trace[: steps[0] + 1], float(out.fitness[0]), bool(solved[0]))
 
     def reset(self, agents: int, position: ArrayLike | None = None, *, scenes: Sequence[Scene] | None = None) -> Step:
@@ -132,13 +111,13 @@ class Simulator:
         [agent, mass, 2], in place of the task's; `scenes` [agent]: one for each in place of the task's."""
         if not isinstance(agents, int) or agents < 1:
             raise InvalidInput("agents: expected a whole number, at least 1", describe(agents))
-        starts = self._starts(agents, position)
+        starts = starts_of(self.task, agents, position)
         if scenes is not None and len(scenes) != agents:
             raise InvalidInput(f"scenes: expected one for each of {agents} agents", str(len(scenes)))
         load_kernel()
         own = None if scenes is None else [self._world.cut(scene) for scene in scenes]
         # a part for each thread, and no more: this memory stays
-        parts = _cut(agents, min(self.threads, -(-agents // WIDTH)))
+        parts = cut_evenly(agents, min(self.threads, -(-agents // WIDTH)))
         self._stepping = [(Batch(self._world, starts[mine], own and own[mine]), mine) for mine in parts]
         out = self._room_for_step("reset", None)
         for batch, mine in self._stepping:
@@ -198,7 +177,7 @@ class Simulator:
         if which.shape != (len(out.stand),) or which.dtype != bool:
             raise InvalidInput(f"which: expected bools of shape [{len(out.stand)}]", describe(which))
         fresh = np.flatnonzero(which)
-        starts = self._starts(len(fresh), position)
+        starts = starts_of(self.task, len(fresh), position)
         if scenes is not None and (len(scenes) != len(fresh) or not self._stepping[0][0].own_scenes):
             expected = f"scenes: expected one for each of {len(fresh)} agents, after a reset with scenes"
             raise InvalidInput(expected, str(len(scenes)))
@@ -275,17 +254,6 @@ class Simulator:
                 break
         return final, steps, solved
 
-    def _starts(self, agents: int, position: ArrayLike | None) -> np.ndarray:
-        shape = (agents, self.task.body.mass_count, 2)
-        if position is None:
-            return np.broadcast_to(self.task.position.astype(np.float32), shape)
-        starts = as_numbers("position", position)
-        if starts.shape != shape or not (np.abs(starts) <= LARGEST_COORDINATE).all():
-            raise InvalidInput(
-                f"position: expected finite numbers of shape {list(shape)}", f"shape {list(starts.shape)} or too large"
-            )
-        return starts.astype(np.float32) + np.float32(0)  # no negative zeros
-
     def _spread(self, run: Callable[[Any], None], parts: list[Any]) -> None:
         """Runs every part, over the threads, of which the caller's is one."""
         load_kernel()
@@ -306,29 +274,6 @@ class Simulator:
             for helper in helpers:
                 helper.result()
 
-    def _judge(self, starts: np.ndarray, final: np.ndarray, steps: np.ndarray, solved: np.ndarray) -> Rollout:
-        task = self.task
-        share = task.body.mass / task.body.mass.sum()
-        start, com = (_in_pieces(lambda p: np.einsum("amd,m->ad", p, share), where) for where in (starts, final))
-        travel = com[:, 0] - start[:, 0]
-        if task.fitness == "progress":
-            fitness = travel / task.duration
-        elif task.fitness == "distance":
-            fitness = np.abs(travel) / task.duration
-        elif task.fitness == "elapsed":
-            fitness = np.abs(travel) / (steps * task.physics.dt)
-        else:
-            fitness = np.full(len(steps), np.nan)
-        if task.fitness == "area":
-            fitness = _in_pieces(lambda p: task.body.area(p)[:, 0], final) / task.area_reference[0]
-        out = Rollout(fitness=fitness, steps=steps, solved=solved, com=com, start=start, position=final)
-        if callable(task.fitness):
-            fitness = np.asarray(task.fitness(out), dtype=np.float64)
-            if fitness.shape != steps.shape:
-                raise InvalidInput(f"fitness: expected numbers of shape [{len(steps)}]", f"shape {list(fitness.shape)}")
-            out = msgspec.structs.replace(out, fitness=fitness)
-        return out
-
 
 class _Work:
     """Agents that are to run a whole task, in parts that any thread may run in any order."""
@@ -338,7 +283,7 @@ class _Work:
         self._simulator = simulator
         self._theta = check_theta(theta, task.body, task.condition, task.controller)
         agents = len(self._theta)
-        self._starts = simulator._starts(agents, position)
+        self._starts = starts_of(task, agents, position)
         self._final = np.empty(self._starts.shape, dtype=np.float32)
         self._steps = np.empty(agents, dtype=np.int64)
         self._solved = np.empty(agents, dtype=bool)
@@ -352,7 +297,7 @@ class _Work:
 
     def rollout(self) -> Rollout:
         """What came of them, once all parts are run."""
-        return self._simulator._judge(self._starts, self._final, self._steps, self._solved)
+        return judge(self._simulator.task, self._starts, self._final, self._steps, self._solved)
 
 
 def replay(
@@ -437,22 +382,10 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _in_pieces(measure: Callable[[np.ndarray], np.ndarray], position: np.ndarray) -> np.ndarray:
-    """What `measure` finds of every agent's `position` [agent, mass, 2] in float64, of which there is no whole copy."""
-    parts = _cut(len(position), max(1, -(-len(position) // AGENTS_AT_ONCE)))
-    return np.concatenate([measure(position[part].astype(np.float64)) for part in parts])
-
-
 def _parts(agents: int, threads: int, most: int = BLOCKS_AT_ONCE) -> list[slice]:
     """The batch cut evenly: for every thread a part, as long as that fills lanes, none of more than `most` blocks."""
     blocks = -(-agents // WIDTH)
-    return _cut(agents, max(min(threads, blocks), -(-blocks // most)))
-
-
-def _cut(agents: int, parts: int) -> list[slice]:
-    """Agents cut into equal parts."""
-    bounds = [agents * k // parts for k in range(parts + 1)] if parts else []
-    return [slice(a, b) for a, b in pairwise(bounds)]
+    return cut_evenly(agents, max(min(threads, blocks), -(-blocks // most)))
 
 
 @lru_cache

@@ -35,7 +35,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     import numpy as np
 
     from turgor.evolution.loop import evaluate
-    from turgor.evolution.worlds import judge
+    from turgor.evolution.worlds import judge_generation
     from turgor.files import write_whole
     from turgor.recording import tangled
     from turgor.runs import Run
@@ -44,7 +44,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     run = Run.open(options.run)
     champion, unit, robust = run.checked_champion(), unit_of(run.task), run.settings.robust
     simulator, theta = Simulator(run.task, threads=options.threads), champion.theta
-    again = float(judge(simulator, theta[None], robust, run.settings.seed, champion.generation).fitness[0])
+    again = float(judge_generation(simulator, theta[None], robust, run.settings.seed, champion.generation).fitness[0])
     out = evaluate(simulator, theta, options.repeats)
     low, median, high = np.percentile(out.fitness, [25, 50, 75]).tolist()
     least, most = float(out.fitness.min()), float(out.fitness.max())

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from turgor.cluster.crew import Crew
 from turgor.control import Sinusoid, check_theta
 from turgor.physics.model import WIDTH
-from turgor.simulate import Rollout, Simulator
+from turgor.rollout import Rollout, judge, starts_of
+from turgor.simulate import Simulator
 from turgor.task import Task
 
 SMALLEST, LARGEST = 128, 512  # [agent], of a shard: far more work than the way to a worker and back; far less than all
@@ -43,8 +44,8 @@ class ShardedSimulator(Simulator):
             return super().rollout(theta, position)
         if self._too_few(len(theta)):
             return super().rollout(theta)
-        (found,) = self._simulated([self._task_sent], theta)
-        return self._judge(self._starts(len(theta), None), *found)
+        (found,) = self._simulated([self.task], theta)
+        return found
 
     def rollout_in(self, tasks: Sequence[Task], theta: ArrayLike) -> list[Rollout]:
         """What `Simulator.rollout_in` returns; too few agents for two shards are simulated here.
@@ -54,14 +55,13 @@ class ShardedSimulator(Simulator):
         theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
         if self._too_few(len(theta)):
             return super().rollout_in(tasks, theta)
-        judges = [Simulator(task, threads=1) for task in tasks]
-        found = self._simulated([_packed(task) for task in tasks], theta)
-        return [judge._judge(judge._starts(len(theta), None), *one) for judge, one in zip(judges, found, strict=True)]
+        return self._simulated(tasks, theta)
 
-    def _simulated(self, tasks: list[bytes], theta: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Final positions, steps and solved of `theta` in each of `tasks`: the shards of all of them at once."""
+    def _simulated(self, tasks: Sequence[Task], theta: np.ndarray) -> list[Rollout]:
+        """The rollouts of `theta` in each of `tasks`, whose shards are in hand all at once."""
         shards = cut_into_shards(self._as_sent(theta), self._crew.threads)
-        jobs = [(task, shard) for task in tasks for shard in shards]
+        packed = [self._task_sent if task is self.task else _packed(task) for task in tasks]
+        jobs = [(task, shard) for task in packed for shard in shards]
         crew, answers, begun = self._crew, dict[Any, Any](), 0
         try:
             while len(answers) < len(jobs):
@@ -72,9 +72,10 @@ class ShardedSimulator(Simulator):
         finally:
             crew.drop()
         found = []
-        for first in range(0, len(jobs), len(shards)):
-            final, steps, solved = zip(*(answers[first + k] for k in range(len(shards))), strict=True)
-            found.append((np.concatenate(final), np.concatenate(steps), np.concatenate(solved)))
+        for k, task in enumerate(tasks):
+            parts = [answers[k * len(shards) + n] for n in range(len(shards))]
+            final, steps, solved = (np.concatenate(part) for part in zip(*parts, strict=True))
+            found.append(judge(task, starts_of(task, len(theta), None), final, steps, solved))
         return found
 
     def _too_few(self, agents: int) -> bool:

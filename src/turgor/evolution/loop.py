@@ -21,7 +21,7 @@ from turgor.arrays import as_numbers
 from turgor.errors import InvalidInput, WorkLost, describe
 from turgor.evolution import STRATEGIES
 from turgor.evolution.strategy import Degenerate, Strategy, built_in
-from turgor.evolution.worlds import check_worlds, judge
+from turgor.evolution.worlds import check_worlds, judge_generation
 from turgor.files import NotWritten
 from turgor.records import MOST_REPEATS, RECORD, Champion, Checkpoint, Settings
 from turgor.runs import Run, current_versions
@@ -295,7 +295,7 @@ def _generations(
         with clock.of("strategy"):
             theta = optimizer.ask()
         with clock.of("simulation"):
-            out = judge(simulator, theta, run.settings.robust, run.settings.seed, run.generation + 1)
+            out = judge_generation(simulator, theta, run.settings.robust, run.settings.seed, run.generation + 1)
         median = _note_generation(run, theta, out, sigma, clock.total())
         with clock.of("strategy"):
             optimizer.tell(theta, out.fitness)

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from turgor.physics.memory import check_memory
+from turgor.rollout import Rollout
 from turgor.scene import ground_heights
-from turgor.simulate import Rollout, Simulator
+from turgor.simulate import Simulator
 from turgor.task import REST_GAP, Task
 from turgor.variants import Robust
 
@@ -71,7 +72,9 @@ def _moved(task: Task, shift: float) -> np.ndarray:
     return task.position + np.array([shift, max(0.0, float(missing.max()))])
 
 
-def judge(simulator: Simulator, theta: ArrayLike, robust: Robust | None, seed: int, generation: int) -> Rollout:
+def judge_generation(
+    simulator: Simulator, theta: ArrayLike, robust: Robust | None, seed: int, generation: int
+) -> Rollout:
     """The `Rollout` by which the agents of a generation, `theta` [agent, parameter], are judged: in the task's world
     or, where `robust` says so, in those of `draw_worlds`."""
     if robust is None:

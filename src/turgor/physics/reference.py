@@ -98,18 +98,21 @@ def start(
     velocity: ArrayLike | None = None,
     dtype: DTypeLike = np.float64,
 ) -> State:
-    """The state before step 1. `position` [m] and `velocity` [m/s], shape [mass, 2], replace the task's."""
+    """The state before step 1. `position` [m] and `velocity` [m/s], shape [mass, 2], replace the task's; with an index
+    of agents before that, sensing, control, actuation and the gas's force are those of many at once."""
     body = task.body
-    velocity = np.zeros((body.mass_count, 2)) if velocity is None else velocity
+    position = np.array(task.position if position is None else position, dtype=dtype)
+    agents = position.shape[:-2]
     return State(
-        position=np.array(task.position if position is None else position, dtype=dtype),
-        velocity=np.array(velocity, dtype=dtype),
-        pressure=task.pressure_start.astype(dtype),
-        rest_length=body.rest_length.astype(dtype),
-        touch=np.zeros(body.mass_count, dtype=bool),
+        position=position,
+        velocity=np.zeros_like(position) if velocity is None else np.array(velocity, dtype=dtype),
+        pressure=np.tile(task.pressure_start.astype(dtype), (*agents, 1)),
+        rest_length=np.tile(body.rest_length.astype(dtype), (*agents, 1)),
+        touch=np.zeros(position.shape[:-1], dtype=bool),
         spring_impulse=np.zeros(body.spring_count, dtype),
         window=deque(maxlen=task.sensing.window),
-        messages=np.zeros((body.spring_count, 2, getattr(task.controller, "messages", 0))),
+        phase=np.zeros(agents),
+        messages=np.zeros((*agents, body.spring_count, 2, getattr(task.controller, "messages", 0))),
     )
 
 
@@ -166,24 +169,24 @@ def pressure_force(state: State, task: Task) -> np.ndarray:
     """Force of the gas on each mass [N], shape [mass, 2]; with true lengths the forces sum to zero."""
     # each edge d of a counter-clockwise loop gives both of its ends p/2 (d_y, -d_x): p l/2 outwards
     force = np.zeros_like(state.position)
-    for loop, p in zip(task.body.chambers, state.pressure, strict=True):
+    for c, loop in enumerate(task.body.chambers):
         i, j = np.array(loop), np.roll(loop, -1)
-        d = state.position[j] - state.position[i]
+        d = state.position[..., j, :] - state.position[..., i, :]
         if task.physics.pressure_length == "commanded":
-            l = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
-            d = d * (commanded_length(state, task, i, j) / l)[:, None]
-        push = p / 2 * np.stack([d[:, 1], -d[:, 0]], axis=1)
-        force[i] += push
-        force[j] += push
+            l = np.maximum(np.linalg.norm(d, axis=-1), 1e-9)
+            d = d * (commanded_length(state, task, i, j) / l)[..., None]
+        push = state.pressure[..., c, None, None] / 2 * np.stack([d[..., 1], -d[..., 0]], axis=-1)
+        force[..., i, :] += push
+        force[..., j, :] += push
     return force
 
 
 def commanded_length(state: State, task: Task, i: np.ndarray, j: np.ndarray) -> np.ndarray:
     """Rest length [m] of the spring that joins masses i and j; their true distance where none does."""
-    length = np.linalg.norm(state.position[j] - state.position[i], axis=1)
+    length = np.linalg.norm(state.position[..., j, :] - state.position[..., i, :], axis=-1)
     for spring, pair in enumerate(task.body.springs):
         joined = np.isin(i, pair) & np.isin(j, pair)
-        length[joined] = state.rest_length[spring]
+        length[..., joined] = state.rest_length[..., spring, None]
     return length
 
 
@@ -369,7 +372,7 @@ def rollout(
         else:
             step_given(state, task, task.body.rest_length, task.pressure[t])
         record.append(snapshot(state))
-        solved = has_ended(state, task)
+        solved = bool(has_ended(state, task))
         if solved:
             break
     rec = recording(task, record, observation=np.array(observations) if observations else None, solved=solved)
@@ -411,14 +414,16 @@ def recording(task: Task, record: list[tuple[np.ndarray, ...]], **rest: Any) -> 
     return Recording(body=task.body, scene=task.scene, dt=task.physics.dt, **arrays, **rest)
 
 
-def has_ended(state: State, task: Task) -> bool:
+def has_ended(state: State, task: Task) -> np.ndarray:
     """Whether the task's end is reached: for `Leave`, every square wholly outside |x| <= half_width."""
+    agents = state.position.shape[:-2]
     if task.end is None:
-        return False
+        return np.zeros(agents, dtype=bool)
     if not isinstance(task.end, Leave):
-        return bool(task.end(state.position[None])[0])
+        ended = task.end(state.position.reshape(-1, *state.position.shape[-2:]))
+        return np.asarray(ended, dtype=bool).reshape(agents)
     width = np.abs(geometry(task, state.position.dtype).vertex[..., 0]).max(axis=1)
-    return bool((np.abs(state.position[:, 0]) - width > task.end.half_width).all())
+    return (np.abs(state.position[..., 0]) - width > task.end.half_width).all(axis=-1)
 
 
 def fitness(rec: Recording, task: Task) -> float | None:

@@ -1,0 +1,1 @@
+"""Fidelity: the same agents in other physics engines, and what differs."""
