@@ -71,11 +71,12 @@ def subject_of(run: Run, name: str) -> Subject:
     """What a record says of the champion of `run`, called `name`. Raises `InvalidInput` where there is none yet."""
     champion, facts, recipe = run.checked_champion(), facts_of_run(run), run.settings.recipe or {}
     known = ("name", "body", "condition", "seed", "controller")
+    changes = [f"{key}={value}" for key, value in recipe.items() if key not in known]
     return Subject(
         run=name,
         task=facts["name"],
         **{key: facts[key] for key in ("title", "unit", "body", "condition", "controller", "seed")},
-        change=" ".join(f"{key}={value}" for key, value in recipe.items() if key not in known),
+        change=" ".join([*changes, *(["robust"] if run.settings.robust else [])]),
         generation=champion.generation,
         dt=run.task.physics.dt,
         identity=run.task.identity,
