@@ -26,10 +26,10 @@ from turgor.experiments.rows import read_rows
 from turgor.experiments.statistics import median_difference
 from turgor.fidelity import compare
 from turgor.fidelity.campaign import crosscheck_campaign, crosscheck_run
-from turgor.fidelity.check_figures import draw_run
 from turgor.fidelity.compare import Sample, Verdict, crosscheck, kolmogorov_smirnov, rank_correlation
 from turgor.fidelity.drive import new_trace, run
 from turgor.fidelity.engines import Crew, make_job
+from turgor.fidelity.figures import draw_run
 from turgor.fidelity.golden import Case, open_loop_cases
 from turgor.fidelity.records import Row, Summary, read_record
 from turgor.recording import Recording

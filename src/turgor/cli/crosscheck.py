@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from turgor.fidelity.records import Record, Summary
 
 NOT_HELD = 1  # exit status of --check
-SUITE = Path("results/fidelity")
+SUITE = Path("runs/fidelity")
 
 
 def _options(parser: Parser) -> None:
@@ -47,7 +47,7 @@ def _options(parser: Parser) -> None:
         "--suite",
         action="store_true",
         help="in place of a run: golden data, contacts, random controllers and a campaign's champions in every engine, "
-        "as a report (default of --out: results/fidelity)",
+        "as a report (default of --out: runs/fidelity)",
     )
     add("--campaign", type=Path, metavar="FOLDER", help="with --suite: whose champions (default: runs/paper)")
 

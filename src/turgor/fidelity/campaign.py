@@ -23,9 +23,9 @@ import numpy as np
 from turgor.errors import InvalidInput, WorkLost
 from turgor.experiments.rows import write_rows
 from turgor.experiments.sheets import write_drawing
-from turgor.fidelity.check_figures import draw_campaign, draw_run
 from turgor.fidelity.compare import CONTROLLERS, Case, Crosscheck, controllers_for, crosschecks, engines_for, name_of
 from turgor.fidelity.engines import Crew, check_engine
+from turgor.fidelity.figures import draw_campaign, draw_run
 from turgor.fidelity.records import (
     Record,
     Row,
