@@ -35,10 +35,12 @@ from turgor.cli import main
 from turgor.control import MLP, Distributed, Linear, Sinusoid
 from turgor.errors import InvalidInput
 from turgor.evolution.loop import evolve, resume
+from turgor.evolution.worlds import check_worlds, draw_worlds
 from turgor.files import DIGEST, write_arrays
 from turgor.runs import Run
 from turgor.simulate import Simulator
 from turgor.task import Task, make_task, task_from_json, task_to_json
+from turgor.variants import Robust
 from turgor.web.replay import read_header, read_replay, replay_of_run
 from turgor.web.server import MESSAGE_BYTES
 from turgor.web.session import Control, Drag, Drop, Reset, Session, Start, read
@@ -187,7 +189,8 @@ def corpus() -> tuple[Path, ...]:
         folder = place / name
         recipe = {"name": task.name, "body": "small", "seed": 0}
         strategy = partial(built_in(name), population=4)
-        evolve(task, 12, 0, folder, strategy=strategy, threads=1, robust_repeats=2, recipe=recipe)
+        robust = Robust(worlds=2) if task.name == "hilly" else None
+        evolve(task, 12, 0, folder, strategy=strategy, threads=1, robust_repeats=2, recipe=recipe, robust=robust)
         folders.append(folder)
     return tuple(folders)
 
@@ -256,6 +259,10 @@ def use_record(data: bytes) -> None:
     look_at(folder)
     run = Run.open(folder)
     try_task(run.task)
+    if run.settings.robust is not None:
+        check_worlds(run.task, run.settings.robust)
+        for task in draw_worlds(run.task, run.settings.robust, run.settings.seed, 1)[:2]:
+            try_task(task)
 
 
 def try_task(task: Task) -> None:
@@ -827,7 +834,7 @@ WORDS = [
 PATHS = ["", ".", "..", "/dev/null", "/dev/null/x", "/proc/self/nothing/x", "a\x00b", "\udc80", "x" * 300, "y/" * 2500,
          "new/deep/er", "file.txt", "run", "é", "-", "--", "~", "run/run.json", "/dev/full"]  # fmt: skip
 # what would be long or large if it were accepted, and is not: these take no number that is merely large
-LASTING = {"--evaluations", "--steps", "--repeats", "--seeds", "--to", "--size"}
+LASTING = {"--evaluations", "--steps", "--repeats", "--robust-worlds", "--seeds", "--to", "--size"}
 REFUSED_NUMBERS = [w for w in WORDS if w not in ("1000000000000", "1000000", "1,000", "1_000", "٣")]
 
 
@@ -852,6 +859,7 @@ CHEAP: dict[str, list[str]] = {
     # those that would go on for long have something that is refused
     "view": ["nothing-there", "--no-browser"],
     "reproduce": ["--body", "tiny", "--out", "campaign"],
+    "crosscheck": ["run", "--engines", "nothing", "--out", "crossed"],
     "bench": ["--only", "nothing"],
 }  # fmt: skip
 
@@ -863,7 +871,7 @@ def make_command(random: Random) -> bytes:
     for _ in range(random.choice((1, 1, 2, 3))):
         what = random.random()
         option = random.choice(options_of(name))
-        words = PATHS if option in ("--out", "--json", "--csv", "--gallery") else WORDS
+        words = PATHS if option in ("--out", "--json", "--csv", "--gallery", "--campaign") else WORDS
         words = REFUSED_NUMBERS if option in LASTING else words
         value = random.choice(words)
         if what < 0.6:
@@ -874,7 +882,7 @@ def make_command(random: Random) -> bytes:
                 argv += [option, value]
             else:
                 argv.append(f"{option}={value}")
-        elif what < 0.7 and name in ("resume", "evaluate", "video", "export"):
+        elif what < 0.7 and name in ("resume", "evaluate", "video", "export", "crosscheck"):
             argv[1] = random.choice(PATHS)
         elif what < 0.8 and name not in ("view", "reproduce", "bench"):
             argv.insert(random.randrange(1, len(argv) + 1), random.choice(REFUSED_NUMBERS))

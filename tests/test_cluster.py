@@ -28,11 +28,13 @@ from turgor.cluster.shards import LARGEST, SMALLEST, ShardedSimulator, cut_into_
 from turgor.errors import InvalidInput
 from turgor.evolution.loop import evolve, resume
 from turgor.evolution.sep_cma_es import SepCMAES
+from turgor.evolution.worlds import draw_worlds
 from turgor.experiments.campaign import Progress, run_entries
 from turgor.experiments.plan import Entry
 from turgor.runs import Run
 from turgor.simulate import Rollout, Simulator
 from turgor.task import Task, make_task
+from turgor.variants import Robust
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 dask = pytest.importorskip("dask")
@@ -95,6 +97,25 @@ def test_a_run_may_change_between_cluster_and_one_machine(task: Task, client: An
     assert bits_of(resume(Run.open(tmp_path / "there"), 4 * POPULATION)) == alone
     evolve(task, 2 * POPULATION, out=tmp_path / "here", strategy=SPREAD)
     assert bits_of(resume(Run.open(tmp_path / "here"), 4 * POPULATION, executor=client)) == alone
+
+
+def test_a_robust_evolution_has_the_same_bits_on_a_cluster(task: Task, client: Any, tmp_path: Path) -> None:
+    robust = Robust(worlds=3)
+    alone = bits_of(evolve(task, 3 * POPULATION, strategy=SPREAD, threads=2, robust=robust))
+    assert bits_of(evolve(task, 3 * POPULATION, strategy=SPREAD, executor=client, robust=robust)) == alone
+    evolve(task, POPULATION, out=tmp_path / "here", strategy=SPREAD, robust=robust)
+    assert bits_of(resume(Run.open(tmp_path / "here"), 3 * POPULATION, executor=client)) == alone
+
+
+@pytest.mark.parametrize("agents", [2 * SMALLEST - 1, 2 * SMALLEST + 9])  # simulated here, and spread
+def test_rollouts_in_many_tasks_have_the_same_bits(agents: int, client: Any) -> None:
+    task = make_task("escape", steps=60)
+    worlds = draw_worlds(task, Robust(worlds=3, shift=0.3), 0, 1)
+    theta = np.random.default_rng(0).normal(0, 2, (agents, task.parameter_count))
+    here, there = Simulator(task).rollout_in(worlds, theta), ShardedSimulator(task, client).rollout_in(worlds, theta)
+    for one, other in zip(here, there, strict=True):
+        for name in Rollout.__struct_fields__:
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
 
 
 @pytest.mark.parametrize("controller", ["linear", "mlp", "sinusoid", "distributed"])

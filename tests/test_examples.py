@@ -67,7 +67,9 @@ def test_pages_name_what_exists() -> None:
     assert PROGRAMS["README"]
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
-        for command in sorted(set(re.findall(r"turgor (evolve|evaluate|video|bench|resume|reproduce)\b", text))):
+        for command in sorted(
+            set(re.findall(r"turgor (evolve|evaluate|video|bench|resume|reproduce|crosscheck)\b", text))
+        ):
             subprocess.run([sys.executable, "-m", "turgor", command, "--help"], check=True, stdout=subprocess.DEVNULL)
         for link in re.findall(r"\]\(([^)#:]+)\)", text):
             assert (page.parent / link).exists(), f"{page} links to {link}"

@@ -33,6 +33,7 @@ from turgor.runs import Run
 from turgor.scene import Scene, flat, hills
 from turgor.simulate import Simulator
 from turgor.task import Leave, make_task, task_from_json, task_to_json
+from turgor.variants import Robust
 from turgor.web.replay import read_replay
 
 quick = settings(derandomize=True, deadline=None, max_examples=100, database=None)
@@ -59,7 +60,7 @@ def test_what_is_not_hostile_is_taken() -> None:
             assert fuzzing.try_input(fuzzing.TARGETS[name], data), name
     for name, argv in fuzzing.CHEAP.items():
         accepted = fuzzing.try_input(fuzzing.TARGETS["command"], fuzzing.as_json([name, *argv]))
-        assert accepted == (name not in ("view", "reproduce", "bench")), name
+        assert accepted == (name not in ("view", "reproduce", "crosscheck", "bench")), name
     for message in fuzzing.MESSAGES:
         assert fuzzing.try_input(fuzzing.TARGETS["message"], fuzzing.as_json(message))
 
@@ -135,6 +136,10 @@ FOUND: dict[str, tuple[Callable[[], Any], str]] = {
     "settings of 10^12 repeats": (
         lambda: settings_of(robust_repeats=10**12), "robust_repeats: expected a whole number",
     ),
+    "a robust evolution in 10^12 worlds": (
+        lambda: Robust(worlds=10**12), "robust worlds: expected a whole number, 1 to 100",
+    ),
+    "a spread that no number has": (lambda: Robust(gas=10**400), "robust gas: expected a number from 0 to 1"),
     "an endless value in a message": (lambda: task_from_json(b'{"name":"%s"}' % (b"x" * 5000)), "task: "),
     "a replay of 2^64 masses": (
         lambda: read_replay(replay_with("masses", 2**64)), "replay: expected the bytes of a replay"

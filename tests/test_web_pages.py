@@ -17,6 +17,7 @@ from sealing import seal
 
 from turgor.evolution.loop import evolve
 from turgor.task import make_task
+from turgor.variants import Robust
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -199,6 +200,28 @@ def test_a_run_has_numbers_and_curves(open_page: Callable[..., Page]) -> None:
     assert page.locator(".luck circle.value").count() == 2
     page.get_by_text("Settings").click()
     assert "population" in page.inner_text(".facts")
+
+
+def test_a_robust_run_says_what_its_fitness_is(browser: Browser, serve: Callable[..., str], tmp_path: Path) -> None:
+    for name, robust in (("one", Robust(worlds=3, gas=0.125)), ("two", None)):
+        evolve(make_task("flat", steps=20), 42, out=tmp_path / name, robust_repeats=2, robust=robust)
+    address, judged = serve(str(tmp_path)), "median of 3 changed worlds"
+    page = browser.new_page()
+    page.goto(f"{address}#/run/one")
+    page.wait_for_selector(".curves path.line.best")
+    assert "robust: median of 3 changed worlds" in page.inner_text("h1")
+    assert re.search(
+        rf"fitness\s+\S+ m/s\s+{judged}, found in generation [12]", page.inner_text(".tiles"), re.IGNORECASE
+    )
+    assert f"the diamond is what it was chosen for: {judged}." in page.inner_text(".luck")
+    assert str(page.locator(".luck path.mark title").text_content()).startswith(f"{judged}: ")
+    page.get_by_text("Settings").click()
+    assert re.search(r"robust gas\s+0\.125", page.inner_text(".facts"))
+    page.goto(f"{address}#/compare/one/two")
+    page.wait_for_selector(".luck path.mark")
+    marks = page.locator(".luck path.mark title").all_text_contents()
+    assert [mark.partition(":")[0] for mark in marks] == [judged, "from its own start"]
+    page.close()
 
 
 def test_a_campaign_is_the_papers_grid(open_page: Callable[..., Page]) -> None:

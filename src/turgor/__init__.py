@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from turgor.evolution.sep_cma_es import SepCMAES as SepCMAES
     from turgor.evolution.strategy import Degenerate as Degenerate
     from turgor.evolution.strategy import Strategy as Strategy
+    from turgor.evolution.worlds import draw_worlds as draw_worlds
     from turgor.experiments.reproduce import reproduce as reproduce
     from turgor.fidelity.compare import crosscheck as crosscheck
     from turgor.recording import Recording as Recording
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from turgor.task import Task as Task
     from turgor.task import make_task as make_task
     from turgor.task import resting as resting
+    from turgor.variants import Robust as Robust
 
 # One canonical path per name; a module is imported when its first name is asked for, so that
 # `import turgor` and the command line answer at once.
@@ -64,6 +66,7 @@ _HOME = {
     "turgor.evolution.openai_es": ("OpenAIES",),
     "turgor.evolution.sep_cma_es": ("SepCMAES",),
     "turgor.evolution.strategy": ("Degenerate", "Strategy"),
+    "turgor.evolution.worlds": ("draw_worlds",),
     "turgor.experiments.reproduce": ("reproduce",),
     "turgor.fidelity.compare": ("crosscheck",),
     "turgor.recording": ("Recording",),
@@ -72,6 +75,7 @@ _HOME = {
     "turgor.scene": ("Scene", "cage", "flat", "hills"),
     "turgor.simulate": ("Simulator", "Step", "perturbed", "replay"),
     "turgor.task": ("Leave", "Physics", "Task", "make_task", "resting"),
+    "turgor.variants": ("Robust",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 __all__ = sorted(_MODULE)

@@ -19,6 +19,7 @@ import numpy as np
 from turgor.errors import LARGEST_INTEGER, InvalidInput, describe
 from turgor.files import read_whole
 from turgor.task import Task
+from turgor.variants import Robust
 
 FORMAT = 2  # 1: without checksums, and without the history in the checkpoint
 FORMATS = (1, 2)
@@ -51,6 +52,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     sigma: float | None = None  # of the strategy at the start [1]; None: its default
     robust_repeats: int = 30
     recipe: dict[str, Any] | None = None  # arguments of `make_task`, where known
+    robust: Robust | None = None  # in which changed worlds candidates are judged; None: in the task's own
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
@@ -59,14 +61,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
                 raise InvalidInput(f"{name}: expected a whole number, {low} to {high}", describe(value))
         if self.sigma is not None and not 0 < self.sigma < math.inf:
             raise InvalidInput("sigma: expected a positive number", describe(self.sigma))
+        if self.robust is not None and not isinstance(self.robust, Robust):
+            raise InvalidInput("robust: expected a turgor.Robust, as in Robust(worlds=5)", describe(self.robust))
 
 
 class Champion(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """The best agent so far."""
 
     theta: Any  # float64 [parameter]
-    fitness: float
-    steps: int
+    fitness: float  # that it was chosen for: in the task's world or, of a robust run, in its generation's worlds
+    steps: int  # of the run with that fitness, as is `solved`
     solved: bool
     generation: int  # it was found in
     robust: Any = None  # [repeat], its fitness from slightly moved starts; None: not measured yet
@@ -118,6 +122,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 def record_text(record: Record) -> bytes:
     """What run.json says: a field a line, the checksum of all others last."""
     fields = msgspec.to_builtins(record)
+    if record.settings.robust is None:  # so that other runs' files stay what they were before there was any
+        del fields["settings"]["robust"]
     fields["checksum"] = _checksum(fields)
     lines = [f'  "{name}": {msgspec.json.encode(value).decode()}' for name, value in fields.items()]
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()

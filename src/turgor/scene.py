@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from turgor.arrays import LARGEST, LARGEST_COORDINATE, as_numbers
 from turgor.errors import InvalidInput, describe
@@ -175,8 +176,16 @@ def cage(
 
 def highest_ground(scene: Scene, left: float, right: float) -> float:
     """Highest y [m] of the ground (segments with a depth) between x = `left` and x = `right`; 0 without any."""
+    highest = float(ground_heights(scene, left, right))
+    return highest if highest > -np.inf else 0.0
+
+
+def ground_heights(scene: Scene, left: ArrayLike, right: ArrayLike) -> np.ndarray:
+    """The same of many intervals at once, shape [...] of `left` and `right`; minus infinity where there is none."""
     x1, y1, x2, y2 = scene.segments.T
-    low, high = np.maximum(left, np.minimum(x1, x2)), np.minimum(right, np.maximum(x1, x2))
+    low = np.maximum(np.expand_dims(left, -1), np.minimum(x1, x2))
+    high = np.minimum(np.expand_dims(right, -1), np.maximum(x1, x2))
     under = (scene.depth > 0) & (low <= high) & (x1 != x2)
-    heights = [y1[under] + (y2 - y1)[under] * (x[under] - x1[under]) / (x2 - x1)[under] for x in (low, high)]
-    return float(np.max(heights)) if under.any() else 0.0
+    run = np.where(x1 == x2, 1.0, x2 - x1)
+    a, b = (y1 + (y2 - y1) * (x - x1) / run for x in (low, high))
+    return np.where(under, np.maximum(a, b), -np.inf).max(axis=-1, initial=-np.inf)

@@ -72,20 +72,16 @@ class Simulator:
         """A `Rollout` of every row of `theta` [agent, parameter] from the task's start, or from `position` [m],
         shape [agent, mass, 2]. Theta of float32 takes half the memory and gives the same bits as the same numbers in
         float64. Raises `InvalidInput` for another shape or numbers that are not finite."""
-        theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
-        starts = starts_of(self.task, len(theta), position)
-        final = np.empty(starts.shape, dtype=np.float32)
-        steps = np.empty(len(theta), dtype=np.int64)
-        solved = np.empty(len(theta), dtype=bool)
+        work = _Work(self, theta, position)
+        self._spread(work.run, work.parts)
+        return work.rollout()
 
-        def run(part: slice) -> None:
-            batch = Batch(self._world, starts[part])
-            batch.think(theta[part])
-            final[part], steps[part], solved[part] = self._run_whole(batch)
-
-        most = max(1, min(BLOCKS_AT_ONCE, MOST_BYTES // self._world.kernel.block_bytes))
-        self._spread(run, _parts(len(theta), self.threads, most))
-        return judge(self.task, starts, final, steps, solved)
+    def rollout_in(self, tasks: Sequence[Task], theta: ArrayLike) -> list[Rollout]:
+        """A `Rollout` of `theta` [agent, parameter] in each of `tasks`, with the bits that a simulator of each would
+        have, and the threads spread over all of them at once. Raises `InvalidInput`."""
+        works = [_Work(Simulator(task, threads=self.threads), theta) for task in tasks]
+        self._spread(lambda one: one[0].run(one[1]), [(work, part) for work in works for part in work.parts])
+        return [work.rollout() for work in works]
 
     def rollouts(self, chunks: Iterable[ArrayLike]) -> Iterator[Rollout]:
         """A `Rollout` of each of `chunks`, theta [agent, parameter] of any length, with the bits that one `rollout` of
@@ -277,6 +273,31 @@ class Simulator:
         finally:
             for helper in helpers:
                 helper.result()
+
+
+class _Work:
+    """Agents that are to run a whole task, in parts that any thread may run in any order."""
+
+    def __init__(self, simulator: Simulator, theta: ArrayLike, position: ArrayLike | None = None) -> None:
+        task, world = simulator.task, simulator._world
+        self._simulator = simulator
+        self._theta = check_theta(theta, task.body, task.condition, task.controller)
+        agents = len(self._theta)
+        self._starts = starts_of(task, agents, position)
+        self._final = np.empty(self._starts.shape, dtype=np.float32)
+        self._steps = np.empty(agents, dtype=np.int64)
+        self._solved = np.empty(agents, dtype=bool)
+        most = max(1, min(BLOCKS_AT_ONCE, MOST_BYTES // world.kernel.block_bytes))
+        self.parts = _parts(agents, simulator.threads, most)
+
+    def run(self, part: slice) -> None:
+        batch = Batch(self._simulator._world, self._starts[part])
+        batch.think(self._theta[part])
+        self._final[part], self._steps[part], self._solved[part] = self._simulator._run_whole(batch)
+
+    def rollout(self) -> Rollout:
+        """What came of them, once all parts are run."""
+        return judge(self._simulator.task, self._starts, self._final, self._steps, self._solved)
 
 
 def replay(

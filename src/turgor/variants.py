@@ -1,7 +1,8 @@
 """Variants: every number of the `paper` preset that can be changed, with its unit and its default.
 
 They are keyword arguments of `turgor.make_task` and options of the command line, whose help shows the text beside
-each field: the only list there is. No NumPy in here, so that help answers at once.
+each field: the only list there is. `Robust` is the same for a robust evolution, whose worlds vary by themselves. No
+NumPy in here, so that help answers at once.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ Condition = Literal["pressure", "springs", "passive"]
 Fitness = Literal["progress", "distance", "elapsed", "area"]
 Observation = Literal["signed", "unit"]
 PressureLength = Literal["true", "commanded"]
+Keep = Literal["median", "worst"]
 
 
 LARGEST = 1e9  # what a number of the world or of sensing may be, in its unit
@@ -135,6 +137,42 @@ class Inflation(msgspec.Struct, frozen=True):
 
     rest_steps: Annotated[int, "before the pressure rises [step]"] = 360
     ramp_steps: Annotated[int, "until it is p_max [step]"] = 100
+
+
+MOST_WORLDS = 100  # that are simulated at once
+# What a spread may be [1]; of the start [m]: the paper's cages have 1 m free beside each body, 0.015 m below.
+_SPREADS = {"friction": 1.0, "gravity": 1.0, "gas": 1.0, "damping": 1.0, "shift": 1.0, "jitter": 1e-3}
+
+
+class Robust(msgspec.Struct, frozen=True, kw_only=True):
+    """How a robust evolution judges its candidates: each runs once in every one of a few worlds that differ a little
+    from the task's. The worlds are drawn for each generation, and are the same for all of its candidates. A spread s
+    changes a number by a share that is uniform in [-s, s]."""
+
+    worlds: Annotated[int, "worlds of a generation, in each of which a candidate runs once"] = 5
+    keep: Annotated[Keep, "which of its runs counts as the candidate's: the median (of an even number the lower) or "
+                          "the worst"] = "median"  # fmt: skip
+    friction: Annotated[float, "spread of the friction of ground, roof and walls [1]"] = 0.1
+    gravity: Annotated[float, "spread of gravity [1]"] = 0.02
+    gas: Annotated[float, "spread of the amount of gas, and of p_max with it [1]"] = 0.05
+    damping: Annotated[float, "spread of the springs' damping ratio [1]"] = 0.2
+    shift: Annotated[float, "the start moves sideways by up to this [m]"] = 0.05
+    jitter: Annotated[float, "each mass starts up to this beside its place, in x and in y [m]"] = 1e-6
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.worlds, int) or isinstance(self.worlds, bool) or not 1 <= self.worlds <= MOST_WORLDS:
+            raise InvalidInput(f"robust worlds: expected a whole number, 1 to {MOST_WORLDS}", describe(self.worlds))
+        if self.keep not in get_args(Keep):
+            raise one_of("robust keep", get_args(Keep), self.keep)
+        for name, largest in _SPREADS.items():
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= largest:
+                raise InvalidInput(f"robust {name}: expected a number from 0 to {largest:g}", describe(value))
+
+    @property
+    def told(self) -> str:
+        """What a candidate's fitness is, in words."""
+        return f"{self.keep} of {self.worlds} changed worlds" if self.worlds > 1 else "in a changed world"
 
 
 VARIANT_GROUPS: tuple[type[msgspec.Struct], ...] = (General, Physics, Sensing, Elements, Hills, Cage, Inflation)

@@ -8,6 +8,7 @@ import turgor
 from turgor.cli.bench import BENCH
 from turgor.cli.champion import EVALUATE, VIDEO
 from turgor.cli.command import Command, Interrupted, Parser, did_you_mean
+from turgor.cli.crosscheck import CROSSCHECK
 from turgor.cli.evolve import EVOLVE, RESUME
 from turgor.cli.export import EXPORT
 from turgor.cli.reproduce import REPRODUCE
@@ -25,13 +26,14 @@ COMMANDS: dict[str, Command] = {
     "view": VIEW,
     "export": EXPORT,
     "reproduce": REPRODUCE,
+    "crosscheck": CROSSCHECK,
     "bench": BENCH,
 }
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command in `argv`, by default the process's; returns the exit status: 0, 2 for an error that is told
-    in one line, 130 for Ctrl-C."""
+    in one line, 130 for Ctrl-C, 1 where a command was asked to check something that is not so."""
     argv = sys.argv[1:] if argv is None else argv
     try:
         return _run(argv)
@@ -77,7 +79,7 @@ def _fail(message: str) -> int:
 
 
 def _help() -> str:
-    lines = "\n".join(f"  {name:<10}{command.summary}" for name, command in COMMANDS.items())
+    lines = "\n".join(f"  {name:<12}{command.summary}" for name, command in COMMANDS.items())
     return f"""usage: turgor COMMAND [options]
 
 Simulates and evolves pressure-based soft agents: bodies of gas inside a ring of masses and springs.

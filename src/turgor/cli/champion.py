@@ -11,7 +11,10 @@ from turgor.cli.words import name_of, say, spread, unit_of
 from turgor.errors import InvalidInput
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from turgor.runs import Run
+    from turgor.simulate import Simulator
 
 FORMATS = ("mp4", "webm", "gif")  # of a video
 
@@ -32,20 +35,22 @@ def _evaluate(options: argparse.Namespace) -> None:
     import numpy as np
 
     from turgor.evolution.loop import evaluate
+    from turgor.evolution.worlds import judge_generation
     from turgor.files import write_whole
     from turgor.recording import tangled
     from turgor.runs import Run
     from turgor.simulate import Simulator
 
     run = Run.open(options.run)
-    champion, unit = run.checked_champion(), unit_of(run.task)
-    simulator = Simulator(run.task, threads=options.threads)
-    again = float(simulator.rollout(champion.theta[None]).fitness[0])
-    out = evaluate(simulator, champion.theta, options.repeats)
+    champion, unit, robust = run.checked_champion(), unit_of(run.task), run.settings.robust
+    simulator, theta = Simulator(run.task, threads=options.threads), champion.theta
+    again = float(judge_generation(simulator, theta[None], robust, run.settings.seed, champion.generation).fitness[0])
+    out = evaluate(simulator, theta, options.repeats)
     low, median, high = np.percentile(out.fitness, [25, 50, 75]).tolist()
     least, most = float(out.fitness.min()), float(out.fitness.max())
     solved = int(out.solved.sum()) if run.task.end is not None else None
     around = int(tangled(out.position, run.task.body, run.task.scene).sum())
+    changed = _in_other_worlds(run, simulator, options.repeats) if robust else None
     if options.json is not None:
         import msgspec
 
@@ -62,21 +67,44 @@ def _evaluate(options: argparse.Namespace) -> None:
             "tangled": around,
             "each": out.fitness.tolist(),
         }
+        if robust and changed is not None:
+            result |= {"judged": robust.told, "nominal": changed[0], "worlds": changed[1].tolist()}
         data = msgspec.json.format(msgspec.json.encode(result)) + b"\n"
         if str(options.json) == "-":
             say(data.decode().rstrip())
             return
         write_whole(options.json, data)
-    say(f"champion   {champion.fitness:.3f}{unit}, generation {champion.generation} of {options.run}")
+    judged = f" {robust.told}," if robust else ""
+    say(f"champion   {champion.fitness:.3f}{unit},{judged} generation {champion.generation} of {options.run}")
     same = "the same bits" if again == champion.fitness else "not the same: another version or machine made the run"
-    say(f"again      {again:.3f}{unit}, {same}")
+    say(f"again      {again:.3f}{unit}, {same}" + (", the worlds of its generation drawn again" if robust else ""))
+    if changed is not None:
+        say(f"changed    {spread(changed[1], unit)}, of {len(changed[1])} worlds of no generation")
+        say(f"nominal    {changed[0]:.3f}{unit}, in the task's own world; so are all below")
     say(f"robust     {spread(out.fitness, unit)}, of {options.repeats} starts moved by 1e-6 m")
     say(f"range      {least:.3f} to {most:.3f}{unit}")
     if solved is not None:
-        steps = simulator.record(champion.theta).tangled
+        steps = simulator.record(theta).tangled
         say(f"solved     {solved} of {options.repeats}")
         say(f"tangled    {around} of {options.repeats} at the end (a wall through a spring); the champion itself")
         say(f"           in {steps.sum()} of its {len(steps) - 1} steps")
+
+
+def _in_other_worlds(run: Run, simulator: Simulator, count: int) -> tuple[float, np.ndarray]:
+    """The champion's fitness in the task's own world, and in `count` changed ones (as many as there may be) that it was
+    not chosen by, shape [world]."""
+    import msgspec
+    import numpy as np
+
+    from turgor.evolution.worlds import draw_worlds
+    from turgor.variants import MOST_WORLDS
+
+    assert run.settings.robust is not None
+    theta = run.checked_champion().theta[None]
+    robust = msgspec.structs.replace(run.settings.robust, worlds=min(count, MOST_WORLDS))
+    worlds = draw_worlds(run.task, robust, run.settings.seed, generation=0)
+    nominal, *others = (float(out.fitness[0]) for out in simulator.rollout_in([run.task, *worlds], theta))
+    return nominal, np.array(others)
 
 
 EVALUATE = Command(
@@ -125,9 +153,10 @@ def draw_video(run: Run, path: Path, size: tuple[int, int], *, start: float = 0.
     from turgor.simulate import Simulator
     from turgor.view.video import write_video
 
-    champion = run.checked_champion()
+    champion, robust = run.checked_champion(), run.settings.robust
     recording = Simulator(run.task, threads=1).record(champion.theta)
-    title = f"{name_of(run.task, run.settings.recipe)}: {champion.fitness:.2f}{unit_of(run.task)}"
+    fitness = recording.fitness if robust else champion.fitness  # what is seen is the task's own world
+    title = f"{name_of(run.task, run.settings.recipe, robust)}: {fitness:.2f}{unit_of(run.task)}"
     return write_video(recording, path, size=size, start=start, stop=stop, title=title)
 
 

@@ -6,10 +6,15 @@ import argparse
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from turgor.cli.words import say
 from turgor.errors import LARGEST_INTEGER, InvalidInput
+
+if TYPE_CHECKING:
+    import msgspec
+
+    from turgor.variants import Robust
 
 
 class Command(NamedTuple):
@@ -145,14 +150,40 @@ def add_variants(parser: Parser) -> None:
     from turgor.variants import VARIANT_GROUPS
 
     for group in VARIANT_GROUPS:
-        options = parser.add_argument_group(f"variants: {group.__name__.lower()}")
-        defaults = group()
-        for name, hint in get_type_hints(group, include_extras=True).items():
-            kind, text = hint.__origin__, hint.__metadata__[0].replace("None:", "default:")
-            default = getattr(defaults, name)
-            if default is not None:
-                text += f" (default: {default if isinstance(default, str) else format(default, '.6g')})"
-            options.add_argument("--" + name.replace("_", "-"), default=None, help=text, **_kind(kind))
+        _add_fields(parser.add_argument_group(f"variants: {group.__name__.lower()}"), group)
+
+
+def add_robust(parser: Parser) -> None:
+    """The option --robust, and one for each number of `Robust`."""
+    from turgor.variants import Robust
+
+    options = parser.add_argument_group(
+        "robust evolution: each candidate runs in worlds that differ a little (docs/robustness.md)"
+    )
+    options.add_argument(
+        "--robust", action="store_true", help="judge candidates so, as any of the options below does (default: no)"
+    )
+    _add_fields(options, Robust, "robust-")
+
+
+def robust_of(options: argparse.Namespace) -> Robust | None:
+    """The `Robust` that `options` ask for; None where they do not. Raises `InvalidInput`."""
+    from turgor.variants import Robust
+
+    given = {name: getattr(options, f"robust_{name}") for name in Robust.__struct_fields__}
+    given = {name: value for name, value in given.items() if value is not None}
+    return Robust(**given) if options.robust or given else None
+
+
+def _add_fields(options: argparse._ArgumentGroup, group: type[msgspec.Struct], prefix: str = "") -> None:
+    """An option for every field of `group`, with the text that stands beside it and its default."""
+    defaults = group()
+    for name, hint in get_type_hints(group, include_extras=True).items():
+        kind, text = hint.__origin__, hint.__metadata__[0].replace("None:", "default:")
+        default = getattr(defaults, name)
+        if default is not None:
+            text += f" (default: {default if isinstance(default, str) else format(default, '.6g')})"
+        options.add_argument(f"--{prefix}{name.replace('_', '-')}", default=None, help=text, **_kind(kind))
 
 
 def _kind(hint: Any) -> dict[str, Any]:

@@ -15,11 +15,13 @@ from turgor.cli.command import (
     Interrupted,
     Parser,
     add_cluster,
+    add_robust,
     add_threads,
     add_variants,
     connected,
     count,
     number,
+    robust_of,
     whole,
 )
 from turgor.cli.progress import ProgressDisplay
@@ -58,8 +60,9 @@ def _evolve_options(parser: Parser) -> None:
         type=Path,
         metavar="FOLDER",
         help="new folder of the run (default: runs/TASK-BODY-CONDITION-sSEED, with the controller's name before the "
-        "seed if it is not linear, with -2, -3 ... if that exists)",
+        "seed if it is not linear, with -robust for --robust, with -2, -3 ... if that exists)",
     )
+    add_robust(parser)
     add_variants(parser)
 
 
@@ -100,12 +103,15 @@ def _evolve(options: argparse.Namespace) -> None:
 
     given = {name: getattr(options, name) for name in ("population", "sigma") if getattr(options, name) is not None}
     strategy = partial(built_in(options.strategy), **given)
-    out = options.out or free_folder("-".join([task.name, options.body, *controlled(task), f"s{options.seed}"]))
+    robust = robust_of(options)
+    parts = [task.name, options.body, *controlled(task), f"s{options.seed}", *(["robust"] if robust else [])]
+    out = options.out or free_folder("-".join(parts))
     check_new(out)
     recipe = {"name": task.name, "body": options.body, "condition": task.condition, "seed": options.seed, **variants}
+    each = f", each {robust.told}" if robust else ""
     say(
-        f"evolving {name_of(task, recipe)}: {task.parameter_count:,} parameters, {options.evaluations:,} evaluations "
-        f"-> {out}"
+        f"evolving {name_of(task, recipe, robust)}: {task.parameter_count:,} parameters, {options.evaluations:,} "
+        f"evaluations{each} -> {out}"
     )
     with connected(options.cluster) as executor:
         run = _watched(
@@ -120,6 +126,7 @@ def _evolve(options: argparse.Namespace) -> None:
                 progress=display,
                 recipe=recipe,
                 executor=executor,
+                robust=robust,
             ),
         )
     _finish(run, options)
@@ -138,7 +145,8 @@ def _resume(options: argparse.Namespace) -> None:
     changed = [f"{name} {was} -> {now[name]}" for name, was in run.versions.items() if now.get(name, was) != was]
     if changed:
         say(f"note: {', '.join(changed)}: results may differ from those of a run without a pause")
-    say(f"resuming {name_of(run.task, run.settings.recipe)} after {run.evaluations:,} evaluations -> {run.path}")
+    name = name_of(run.task, run.settings.recipe, run.settings.robust)
+    say(f"resuming {name} after {run.evaluations:,} evaluations -> {run.path}")
     with connected(options.cluster) as executor:
         run = _watched(
             options.run,
@@ -166,7 +174,8 @@ def _finish(run: Run, options: argparse.Namespace) -> None:
 
     assert run.path is not None
     started = time.perf_counter()
-    name, unit, champion = name_of(run.task, run.settings.recipe), unit_of(run.task), run.checked_champion()
+    robust, unit, champion = run.settings.robust, unit_of(run.task), run.checked_champion()
+    name = name_of(run.task, run.settings.recipe, robust)
     for path in (run.path / FIGURE, run.path / FILM):
         if path.exists() and path.stat().st_mtime < (run.path / CHAMPION).stat().st_mtime:
             path.unlink()
@@ -182,11 +191,13 @@ def _finish(run: Run, options: argparse.Namespace) -> None:
 
     if run.note:
         say(f"note     {run.note}")
-    say(f"best     {champion.fitness:.3f}{unit}, generation {champion.generation} of {run.generation}")
+    judged = f" {robust.told}," if robust else ""
+    say(f"best     {champion.fitness:.3f}{unit},{judged} generation {champion.generation} of {run.generation}")
     say(f"robust   {spread(champion.robust, unit)}, of {len(champion.robust)} starts moved by 1e-6 m")
     if run.task.end is not None:
         solver = "none" if run.solver is None else f"{run.solver.fitness:.3f}{unit} after {_duration(run, run.solver)}"
-        say(f"solved   best: {'yes' if champion.solved else 'no'}; best that solves the task: {solver}")
+        where = ", in the world that counts" if robust and (champion.solved or run.solver) else ""
+        say(f"solved   best: {'yes' if champion.solved else 'no'}; best that solves the task: {solver}{where}")
     s = run.seconds
     say(
         f"time     {s['total']:.1f} s: simulation {s['simulation']:.1f}, {run.settings.strategy} {s['strategy']:.1f}, "
@@ -208,6 +219,8 @@ EVOLVE = Command(
     "  turgor evolve\n"
     "  turgor evolve --task escape --body large --condition springs --seed 3\n"
     "  turgor evolve --body large --strategy sep-cma-es --population 50\n"
+    "  turgor evolve --robust\n"
+    "  turgor evolve --robust-worlds 9 --robust-keep worst --robust-friction 0.2\n"
     "  turgor evolve --strategy sep-cma-es --population 10000 --evaluations 1000000 --cluster tcp://host:8786\n"
     "  turgor evolve --gravity 9.81 --window 15 --observation unit --out runs/variant",
     _evolve_options,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from turgor.task import Task
+    from turgor.variants import Robust
 
 
 def say(text: str = "") -> None:
@@ -21,10 +22,11 @@ def say(text: str = "") -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def name_of(task: Task, recipe: dict[str, Any] | None) -> str:
+def name_of(task: Task, recipe: dict[str, Any] | None, robust: Robust | None = None) -> str:
     """What a run of `task` is called; with the recipe that it was made from, its body and seed as well."""
     parts = [task.name, str(recipe["body"])] if recipe else [task.name]
-    return ", ".join([*parts, *controlled(task), *([f"seed {recipe['seed']}"] if recipe else [])])
+    parts += [*controlled(task), *(["robust"] if robust else [])]
+    return ", ".join([*parts, *([f"seed {recipe['seed']}"] if recipe else [])])
 
 
 def controlled(task: Task) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import sys
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -41,34 +42,54 @@ class ShardedSimulator(Simulator):
         theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
         if position is not None:
             return super().rollout(theta, position)
-        if len(theta) < 2 * SMALLEST:
-            self._say_once(f"{len(theta)} agents are too few to spread (from {2 * SMALLEST} on); simulated here")
+        if self._too_few(len(theta)):
             return super().rollout(theta)
-        shards = cut_into_shards(self._as_sent(theta), self._crew.threads)
-        final, steps, solved = (np.concatenate(parts) for parts in zip(*self._simulated(shards), strict=True))
-        return judge(self.task, starts_of(self.task, len(theta), None), final, steps, solved)
+        (found,) = self._simulated([self.task], theta)
+        return found
 
-    def _simulated(self, shards: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Final positions, steps and solved of every shard, in their order."""
+    def rollout_in(self, tasks: Sequence[Task], theta: ArrayLike) -> list[Rollout]:
+        """What `Simulator.rollout_in` returns; too few agents for two shards are simulated here.
+
+        Raises also what `Crew.wait` raises.
+        """
+        theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
+        if self._too_few(len(theta)):
+            return super().rollout_in(tasks, theta)
+        return self._simulated(tasks, theta)
+
+    def _simulated(self, tasks: Sequence[Task], theta: np.ndarray) -> list[Rollout]:
+        """The rollouts of `theta` in each of `tasks`, whose shards are in hand all at once."""
+        shards = cut_into_shards(self._as_sent(theta), self._crew.threads)
+        packed = [self._task_sent if task is self.task else _packed(task) for task in tasks]
+        jobs = [(task, shard) for task in packed for shard in shards]
         crew, answers, begun = self._crew, dict[Any, Any](), 0
         try:
-            while len(answers) < len(shards):
-                while begun < len(shards) and crew.jobs < max(IN_HAND_A_THREAD * crew.threads, 1):
-                    crew.give(begun, simulate_shard, self._task_sent, shards[begun])
+            while len(answers) < len(jobs):
+                while begun < len(jobs) and crew.jobs < max(IN_HAND_A_THREAD * crew.threads, 1):
+                    crew.give(begun, simulate_shard, *jobs[begun])
                     begun += 1
                 answers.update(crew.wait())
         finally:
             crew.drop()
-        return [answers[k] for k in range(len(shards))]
+        found = []
+        for k, task in enumerate(tasks):
+            parts = [answers[k * len(shards) + n] for n in range(len(shards))]
+            final, steps, solved = (np.concatenate(part) for part in zip(*parts, strict=True))
+            found.append(judge(task, starts_of(task, len(theta), None), final, steps, solved))
+        return found
+
+    def _too_few(self, agents: int) -> bool:
+        """Whether `agents` are too few to spread; says so once."""
+        few = agents < 2 * SMALLEST
+        if few and not self._said:
+            self._said = True
+            text = f"turgor: {agents} agents are too few to spread (from {2 * SMALLEST} on); simulated here"
+            print(text, file=sys.stderr, flush=True)
+        return few
 
     def _as_sent(self, theta: np.ndarray) -> np.ndarray:
         """Half the bytes, where the kernel rounds to float32 before it does anything else."""
         return theta if isinstance(self.task.controller, Sinusoid) else theta.astype(np.float32)
-
-    def _say_once(self, text: str) -> None:
-        if not self._said:
-            self._said = True
-            print(f"turgor: {text}", file=sys.stderr, flush=True)
 
 
 def cut_into_shards(theta: np.ndarray, threads: int) -> list[np.ndarray]:

@@ -21,11 +21,13 @@ from turgor.arrays import as_numbers
 from turgor.errors import InvalidInput, WorkLost, describe
 from turgor.evolution import STRATEGIES
 from turgor.evolution.strategy import Degenerate, Strategy, built_in
+from turgor.evolution.worlds import check_worlds, judge_generation
 from turgor.files import NotWritten
 from turgor.records import MOST_REPEATS, RECORD, Champion, Checkpoint, Settings
 from turgor.runs import Run, current_versions
 from turgor.simulate import Rollout, Simulator, perturbed
 from turgor.task import Task
+from turgor.variants import Robust
 
 CHECKPOINT_INTERVAL = 10.0  # [s]
 MakeStrategy = Callable[[int, np.random.Generator], Strategy]  # of the number of parameters and the randomness
@@ -56,6 +58,7 @@ def evolve(
     robust_repeats: int = 30,
     recipe: Mapping[str, Any] | None = None,
     executor: Any = None,
+    robust: Robust | None = None,
 ) -> Run:
     """The `Run` that evolves a controller for `task`: its champion, its history and, in the folder `out`, its files.
 
@@ -69,6 +72,8 @@ def evolve(
     every generation. `recipe` is kept in run.json: the arguments of `make_task`. `out=None` keeps all in memory.
     `executor`: a Dask `Client`, over whose workers generations of a few hundred agents and more are spread, with the
     same bits whatever the workers are and whatever becomes of them (docs/cluster.md); None: all is done here.
+    `robust`: an agent's fitness is the median, or the worst, of what it achieves in a few worlds that differ from the
+    task's at random, as in `Robust(worlds=5)` (docs/robustness.md); an evaluation is then so many rollouts.
 
     Ctrl-C ends it after the generation in hand, a second one at once: what was evolved is kept in `out`,
     `resume` goes on from there, and `KeyboardInterrupt` is raised. Raises `InvalidInput` for a task without anything
@@ -78,7 +83,9 @@ def evolve(
     started = time.perf_counter()
     simulator = _simulator(task, threads, executor)
     with _told_what_is_kept(out):
-        run, optimizer = begin(task, evaluations, seed, out, strategy, simulator.threads, robust_repeats, recipe)
+        run, optimizer = begin(
+            task, evaluations, seed, out, strategy, simulator.threads, robust_repeats, recipe, robust
+        )
         with contextlib.closing(run):
             return _carry_on(run, simulator, optimizer, progress, _Clock(run.seconds, started))
 
@@ -92,6 +99,7 @@ def begin(
     threads: int,
     robust_repeats: int = 30,
     recipe: Mapping[str, Any] | None = None,
+    robust: Robust | None = None,
 ) -> tuple[Run, Strategy]:
     """A new run and its strategy, before the first generation; see `evolve`."""
     for name, value in (("evaluations", evaluations), ("robust_repeats", robust_repeats)):
@@ -112,7 +120,10 @@ def begin(
         threads=threads,
         robust_repeats=robust_repeats,
         recipe=None if recipe is None else dict(recipe),
+        robust=robust,
     )
+    if robust is not None:
+        check_worlds(task, robust)
     return Run.create(task, settings, out), optimizer
 
 
@@ -284,7 +295,7 @@ def _generations(
         with clock.of("strategy"):
             theta = optimizer.ask()
         with clock.of("simulation"):
-            out = simulator.rollout(theta)
+            out = judge_generation(simulator, theta, run.settings.robust, run.settings.seed, run.generation + 1)
         median = _note_generation(run, theta, out, sigma, clock.total())
         with clock.of("strategy"):
             optimizer.tell(theta, out.fitness)

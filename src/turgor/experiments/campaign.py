@@ -140,6 +140,10 @@ def open_run(folder: Path, entry: Entry) -> Run | None:
                 f"{path}: expected a run of {value} {name}; choose another folder, or the setting it has",
                 f"one of {found}",
             )
+    if run.settings.robust is not None:
+        raise InvalidInput(
+            f"{path}: expected a run that is not robust; choose another folder", run.settings.robust.told
+        )
     if run.task.identity != task.identity:
         raise InvalidInput(f"{path}: expected the task {task.name} of this version; choose another folder", "another")
     return run

@@ -38,6 +38,7 @@ FINE = 0.01  # [fitness]: the same where the fitness itself is near 0
 WEAK = 0.8  # [1], of the fitness: a champion that keeps less has not held
 
 Verdict = Literal["the same", "close", "stronger", "mixed", "weaker", "does not hold"]
+HOLDS: tuple[Verdict, ...] = ("the same", "close", "stronger")
 
 
 class Case(NamedTuple):
@@ -80,6 +81,11 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     verdict: Verdict
     says: str  # the verdict in words
 
+    @property
+    def holds(self) -> bool:
+        """Whether the controller is worth as much in this engine."""
+        return self.verdict in HOLDS
+
 
 class Crosscheck(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """One controller in several engines."""
@@ -89,12 +95,12 @@ class Crosscheck(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     recordings: dict[str, Recording]  # by engine, from the task's start
 
     def __repr__(self) -> str:
-        return "\n".join(f"{ENGINES[c.engine].says}: {c.says}" for c in self.comparisons)
+        return "\n".join(f"{name_of(c.engine)}: {c.says}" for c in self.comparisons)
 
     @property
     def holds(self) -> bool:
         """Whether the controller is worth as much in every other engine."""
-        return all(c.verdict in ("the same", "close", "stronger") for c in self.comparisons)
+        return all(comparison.holds for comparison in self.comparisons)
 
 
 def crosscheck(
@@ -121,9 +127,14 @@ def crosscheck(
     """
     theta = np.reshape(as_numbers("theta", theta), (1, -1))
     theta = check_theta(theta, task.body, task.condition, task.controller)[0]
-    case = Case(task, theta, _controllers(task, controllers, seed))
+    case = Case(task, theta, controllers_for(task, controllers, seed))
     with Crew(processes) as crew:
         return next(crosschecks([case], repeats, engines_for(engines), crew, progress))
+
+
+def name_of(engine: str) -> str:
+    """The name of an engine for people."""
+    return HERE if engine == HERE else ENGINES[engine].says
 
 
 def engines_for(names: Sequence[str] | None) -> list[str]:
@@ -138,8 +149,9 @@ def engines_for(names: Sequence[str] | None) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _controllers(task: Task, given: int | ArrayLike, seed: int) -> np.ndarray:
-    """Controllers to be ranked, [controller, parameter]."""
+def controllers_for(task: Task, given: int | ArrayLike, seed: int) -> np.ndarray:
+    """Controllers to be ranked, [controller, parameter]: so many, drawn by `seed`, or those given. Raises
+    `InvalidInput`."""
     if not isinstance(given, int):
         return check_theta(given, task.body, task.condition, task.controller)
     if not 0 <= given <= MOST_REPEATS:
@@ -160,10 +172,13 @@ def crosschecks(
     """A `Crosscheck` of each of `cases` in their order, as soon as it is known. Raises `InvalidInput`."""
     if not isinstance(repeats, int) or not 2 <= repeats <= MOST_REPEATS:
         raise InvalidInput(f"repeats: expected a whole number, 2 to {MOST_REPEATS}", describe(repeats))
-    jobs = [make_job(engine, case.task, *_line_up(case, repeats), record=True) for case in cases for engine in engines]
+    jobs = []
+    for case in cases:
+        agents = _line_up(case, repeats)
+        jobs += [make_job(engine, case.task, *agents, record=True) for engine in engines]
     answers = crew.run(jobs, progress)
     for case in cases:
-        floor = _Floor(case)
+        floor = _Floor(case, crew.processes)
         samples, recordings = [floor.sample(repeats)], {HERE: floor.recording}
         comparisons = []
         for engine in engines:
@@ -199,8 +214,8 @@ def _sample(engine: str, version: str, task: Task, out: Rollout, repeats: int) -
 class _Floor:
     """A case in this engine, and what chaos alone makes of it."""
 
-    def __init__(self, case: Case) -> None:
-        self.case, self.simulator = case, Simulator(case.task)
+    def __init__(self, case: Case, threads: int) -> None:
+        self.case, self.simulator = case, Simulator(case.task, threads=threads)
         moved = perturbed(case.task.position, max(len(case.ranked), 1))
         self.recording = self.simulator.record(case.theta)
         self.parts = first_apart(self.recording, self.simulator.record(case.theta, moved[0]))
@@ -237,7 +252,7 @@ def compare(here: Sample, there: Sample, floor: _Floor, recording: Recording) ->
         parts=first_apart(floor.recording, recording),
         parts_floor=floor.parts,
         verdict=verdict,
-        says=_in_words(verdict, median_here, median, ks, len(there.fitness)),
+        says=_in_words(verdict, median_here, median, low, high, ks, len(there.fitness)),
     )
 
 
@@ -246,18 +261,26 @@ def judge_medians(here: float, there: float, low: float, high: float, ks_p: floa
     told_apart = not low <= 0 <= high
     if not told_apart:
         return "the same" if ks_p >= SURE else "mixed"
-    if max(abs(low), abs(high)) <= max(CLOSE * max(abs(here), abs(there)), FINE):
+    if _is_close(here, there, low, high):
         return "close"
     if there > here:
         return "stronger"
     return "weaker" if here > 0 and there >= WEAK * here else "does not hold"
 
 
-def _in_words(verdict: Verdict, here: float, there: float, ks: float, repeats: int) -> str:
+def _is_close(here: float, there: float, low: float, high: float) -> bool:
+    """Whether the interval of two medians' difference lies within `CLOSE` of the larger one."""
+    return max(abs(low), abs(high)) <= max(CLOSE * max(abs(here), abs(there)), FINE)
+
+
+def _in_words(verdict: Verdict, here: float, there: float, low: float, high: float, ks: float, starts: int) -> str:
     medians = f"{there:.3g} there, {here:.3g} here"
-    kept = f"keeps {there / here:.0%}" if here > 0 else "falls"
+    kept = f"keeps {there / here:.0%}" if here > 0 <= there else "falls"
+    same = f"holds: {medians}, not to be told from chance in {starts} starts"
+    if not _is_close(here, there, low, high):
+        same = f"holds as far as {starts} starts can tell: {medians}, the difference is {low:+.2g} to {high:+.2g}"
     return {
-        "the same": f"holds: {medians}, not to be told from chance in {repeats} starts",
+        "the same": same,
         "close": f"holds: {medians}, within {CLOSE:.0%}",
         "stronger": f"holds, and does better: {medians}",
         "mixed": f"holds in the median ({medians}), but the distributions differ (KS {ks:.2f})",
@@ -289,6 +312,6 @@ def rank_correlation(a: ArrayLike, b: ArrayLike) -> float | None:
 def first_apart(a: Recording, b: Recording, distance: float = APART) -> int | None:
     """The first step after which any mass is `distance` [m] apart in two recordings; None: never."""
     steps = min(len(a.position), len(b.position))
-    gap = np.abs(np.asarray(a.position[:steps], np.float64) - b.position[:steps]).max(axis=(1, 2))
+    gap = np.linalg.norm(np.asarray(a.position[:steps], np.float64) - b.position[:steps], axis=2).max(axis=1)
     apart = np.flatnonzero(gap >= distance)
     return int(apart[0]) if apart.size else None

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module, metadata
+from multiprocessing.connection import Connection
+from types import TracebackType
 from typing import Any, NamedTuple
 
 import msgspec
@@ -14,12 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from turgor.control import check_theta
-from turgor.errors import InvalidInput, describe, one_of
+from turgor.errors import InvalidInput, WorkLost, describe, one_of
 from turgor.experiments.campaign import follow_first_process
 from turgor.fidelity.drive import Ended, Trace, World, new_trace, run
 from turgor.recording import Recording
 from turgor.rollout import Rollout, cut_evenly, judge, starts_of
-from turgor.simulate import available_cores
+from turgor.simulate import MOST_THREADS, available_cores
 from turgor.task import Task
 
 MOST_TOGETHER = 16  # agents in lockstep: more gain nothing, and Box2D v3 has room for 128 worlds in a process
@@ -67,6 +72,11 @@ def installed() -> list[str]:
     return [engine for engine in ENGINES if is_there(engine)]
 
 
+def check_engine(engine: str, task: Task) -> None:
+    """Raises `InvalidInput` where `load_world` does, and for a task that `engine` has no counterpart of."""
+    load_world(engine)(task, task.position).close()
+
+
 def version_of(engine: str) -> str:
     """The package that `engine` comes with, and its version."""
     package = ENGINES[engine].package
@@ -98,7 +108,7 @@ def make_job(
 ) -> Job:
     """Agents with `theta` [agent, parameter], from the task's start or from `position` [m], shape [agent, mass, 2].
     Raises `InvalidInput` for other shapes, and for what `engine` cannot do."""
-    load_world(engine)
+    check_engine(engine, task)
     theta = check_theta(theta, task.body, task.condition, task.controller)
     return Job(engine, task, theta, starts_of(task, len(theta), position), record)
 
@@ -108,36 +118,46 @@ class Crew:
     spawned, and then a script has to be guarded by `if __name__ == "__main__"`."""
 
     def __init__(self, processes: int | None = None) -> None:
-        """`processes`: None for all cores. Raises `InvalidInput` for fewer than 1."""
-        if processes is not None and (not isinstance(processes, int) or processes < 1):
-            raise InvalidInput("processes: expected a whole number, at least 1", describe(processes))
+        """`processes`: None for all cores. Raises `InvalidInput` for fewer than 1, or more than any machine has."""
+        if processes is not None and (not isinstance(processes, int) or not 1 <= processes <= MOST_THREADS):
+            raise InvalidInput(f"processes: expected a whole number, 1 to {MOST_THREADS}", describe(processes))
         self.processes = processes or available_cores()
         self._pool: Executor
+        self._end: Connection | None = None  # of a pipe: processes end where its other end is closed
+        self._open: Connection | None = None
 
     def __enter__(self) -> Crew:
         if self.processes == 1:
             self._pool = ThreadPoolExecutor(1)
         else:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.processes, context, follow_first_process)
+            self._end, self._open = context.Pipe(duplex=False)
+            self._pool = ProcessPoolExecutor(self.processes, context, _begin, (self._end,))
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if error is not None and self._open is not None:
+            self._open.close()  # as Ctrl-C: what is in hand is of no use any more
         self._pool.shutdown(cancel_futures=True)
+        for end in (self._end, self._open):
+            if end is not None:
+                end.close()
 
     def run(self, jobs: Sequence[Job], progress: Callable[[int, int], object] | None = None) -> Iterator[Done]:
         """What came of each of `jobs`, in their order, as soon as it is known. `progress` is called with the agents
         that are done and with all, whenever some are done."""
-        futures = [[self._submit(job, part) for part in self._parts(job)] for job in jobs]
-        agents = {future: part.stop - part.start for job in futures for future, part in job}
+        agents: dict[Future[tuple[Ended, Trace | None]], int] = {}
         try:
+            futures = [[self._submit(job, part) for part in self._parts(job)] for job in jobs]
+            agents |= {future: part.stop - part.start for job in futures for future, part in job}
             for job, parts in zip(jobs, futures, strict=True):
                 for _ in as_completed([future for future, _ in parts]):
                     if progress is not None:
                         progress(sum(n for future, n in agents.items() if future.done()), sum(agents.values()))
                 yield _joined(job, [future.result() for future, _ in parts])
         except BrokenProcessPool:
-            raise InvalidInput("crosscheck: expected its processes to go on; one was ended from outside") from None
+            expected = "crosscheck: expected its processes to go on; one was ended from outside (memory?)"
+            raise WorkLost(expected) from None
         finally:
             for future in agents:
                 future.cancel()
@@ -152,6 +172,18 @@ class Crew:
         """One for every process, as long as they are not too large."""
         agents = len(job.theta)
         return cut_evenly(agents, max(min(self.processes, agents), -(-agents // MOST_TOGETHER)))
+
+
+def _begin(end: Connection) -> None:
+    """Ends this process where the first one is gone, or has closed the other end of the pipe."""
+    follow_first_process()
+
+    def wait() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            end.recv()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _work(engine: str, task: Task, theta: np.ndarray, starts: np.ndarray, record: bool) -> tuple[Ended, Trace | None]:

@@ -70,7 +70,7 @@ def write_suite(
         out.mkdir(parents=True, exist_ok=True)
         write_suite_tables(out / "fidelity", suite)
     say("figures and page ...")
-    from turgor.fidelity.page import write_page
+    from turgor.fidelity.suite_page import write_page
 
     return write_page(out, suite)
 

@@ -168,6 +168,7 @@ class Library:
         if champion is not None:
             found["champion"] = {
                 "fitness": champion.fitness,
+                "judged": None if run.settings.robust is None else run.settings.robust.told,
                 "generation": champion.generation,
                 "steps": champion.steps,
                 "solved": champion.solved if run.task.end is not None else None,

@@ -98,15 +98,10 @@ def replay_of_run(path: Path, which: str = "best", every: int = 1) -> bytes:
     from turgor.simulate import Simulator  # compiles the engine
 
     recording = Simulator(run.task, threads=1).record(champion.theta)
-    return replay_of_recording(
-        recording,
-        run.task,
-        every=every,
-        fitness=champion.fitness,
-        robust=champion.robust_fitness,
-        solved=champion.solved,
-        **facts_of_run(run),
-    )
+    facts = {"robust": champion.robust_fitness, **facts_of_run(run)}
+    if run.settings.robust is None:  # else it was chosen for what it achieved in other worlds than the one that is seen
+        facts |= {"fitness": champion.fitness, "solved": champion.solved}
+    return replay_of_recording(recording, run.task, every=every, **facts)
 
 
 def facts_of_run(run: Run) -> dict[str, Any]:
@@ -116,9 +111,10 @@ def facts_of_run(run: Run) -> dict[str, Any]:
     body = body if isinstance(body, str) and body in SIZES else "custom"
     controller = next(name for name, kind in CONTROLLERS.items() if kind is type(task.controller))
     controlled = [task.condition] if controller == "linear" else [task.condition, controller]
+    robust = ["robust"] if run.settings.robust else []
     seed = recipe.get("seed", run.settings.seed)
     return {
-        "title": ", ".join([task.name, body, *controlled, f"seed {seed}"]),
+        "title": ", ".join([task.name, body, *controlled, *robust, f"seed {seed}"]),
         "unit": " m/s" if task.fitness in ("progress", "distance", "elapsed") else "",
         "name": task.name,
         "body": body,

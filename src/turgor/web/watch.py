@@ -147,6 +147,8 @@ class RunWatch:
         change = {
             name: v for name, v in recipe.items() if name not in ("name", "body", "condition", "seed", "controller")
         }
+        robust = record.settings.robust
+        changes = [f"{name}={value}" for name, value in change.items()]
         return RunSummary(
             path=self._path,
             name=describe(record.task.name),
@@ -155,7 +157,7 @@ class RunWatch:
             controller=describe(record.task.controller.type).lower(),
             strategy=describe(record.settings.strategy),
             seed=record.settings.seed,
-            change=describe(", ".join(f"{name}={value}" for name, value in change.items())),
+            change=describe(", ".join([*changes, *([f"robust: {robust.told}"] if robust else [])])),
             unit="m/s" if record.task.fitness in ("progress", "distance", "elapsed") else "",
             fitness=record.result.fitness if row is None else row[2],
             robust=record.result.robust_fitness,

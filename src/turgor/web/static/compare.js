@@ -36,7 +36,7 @@ export function show(element, store, a = "", b = "") {
       ["strategy", (run) => run.strategy],
       ["parameters", (run) => (run.task ? count(run.task.parameters) : "–")],
     ];
-    const robust = runs.map((run, k) => ({ values: run.champion?.robust ?? [], kind: `run${k}`, mark: run.champion?.fitness, markName: "from its own start" }));
+    const robust = runs.map((run, k) => ({ values: run.champion?.robust ?? [], kind: `run${k}`, mark: run.champion?.fitness, markName: run.champion?.judged ?? "from its own start" }));
     body.replaceChildren(
       h("section", { class: "card" }, h("table", { class: "two" },
         h("thead", {}, h("tr", {}, h("td"), ["A", "B"].map((name, k) => h("th", { scope: "col" }, h("span", { class: `key best run${k}` }, name))))),

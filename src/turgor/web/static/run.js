@@ -55,10 +55,11 @@ export function show(element, store, path = "") {
     const { champion } = details;
     const solved = champion?.solved ?? null;
     const found = history.columns.best.findIndex((best) => best === run.fitness);
+    const judged = champion?.judged ? `${champion.judged}, ` : ""; // of a robust run
     tiles.replaceChildren(...[
-      ["fitness", number(run.fitness, 3) + unit, found < 0 ? "" : `found in generation ${count(history.columns.generation[found])}`],
+      ["fitness", number(run.fitness, 3) + unit, found < 0 ? "" : `${judged}found in generation ${count(history.columns.generation[found])}`],
       ["robust", number(run.robust, 3) + (run.robust === null ? "" : unit), run.robust !== null ? "median of moved starts" : run.status === "running" ? "measured at the end" : "not measured"],
-      solved === null ? null : ["task", solved ? "solved" : "not solved", solved ? `in ${number(champion.steps * details.task.dt, 1)} s` : ""],
+      solved === null ? null : ["task", solved ? "solved" : "not solved", solved ? `${judged}in ${number(champion.steps * details.task.dt, 1)} s` : ""],
       ["evaluations", count(run.evaluations), `of ${count(run.budget)}, generation ${count(run.generation)}`],
       ["step size σ", number(run.sigma, 4), run.strategy],
     ].filter(Boolean).map(([name, value, note]) =>
@@ -96,10 +97,11 @@ export function show(element, store, path = "") {
     const { settings, task, versions, seconds, champion } = details;
     robust.replaceChildren();
     if (champion?.robust) {
+      const mark = champion.judged ? `what it was chosen for: ${champion.judged}` : "its own start";
       const starts = champion.robust_solved === null ? "" : ` It solves the task from ${champion.robust_solved} of them.`;
       robust.append(h("section", { class: "card luck" }, h("h2", {}, "Luck"),
-        h("p", { class: "muted" }, `The champion from ${champion.robust.length} starts moved by a millionth of a metre; the diamond is its own start.${starts}`),
-        box([{ values: champion.robust, mark: champion.fitness, markName: "from its own start" }], { unit: details.unit, axis: true })));
+        h("p", { class: "muted" }, `The champion from ${champion.robust.length} starts moved by a millionth of a metre; the diamond is ${mark}.${starts}`),
+        box([{ values: champion.robust, mark: champion.fitness, markName: champion.judged ?? "from its own start" }], { unit: details.unit, axis: true })));
     }
     const others = [...store.runs.values()].filter((run) => run.path !== path).sort((a, b) => (alike(b) - alike(a)) || (a.path < b.path ? -1 : 1));
     const select = h("select", { "aria-label": "Compare with", onchange: () => select.value && (location.hash = compareHref(path, select.value)) },
@@ -109,10 +111,11 @@ export function show(element, store, path = "") {
         [h("dt", {}, key.replaceAll("_", " ")), h("dd", {}, typeof value === "number" && !Number.isInteger(value) ? number(value, 3) : String(value))])));
     facts.replaceChildren(
       others.length ? h("p", {}, h("label", {}, "Compare with ", select)) : "",
-      table("Settings", { ...settings, ...settings?.recipe }), table("Task", task), table("Time [s]", seconds), table("Versions", versions),
+      table("Settings", { ...settings, ...settings?.recipe, ...named("robust", settings?.robust) }), table("Task", task), table("Time [s]", seconds), table("Versions", versions),
     );
   }
 
+  const named = (prefix, entries) => Object.fromEntries(Object.entries(entries ?? {}).map(([key, value]) => [`${prefix} ${key}`, value]));
   const alike = (run) => ["name", "body", "condition"].filter((key) => run[key] === details[key]).length;
 
   function onLibrary() {

@@ -10,10 +10,10 @@ import numpy as np
 from turgor.experiments.plan import BODIES
 from turgor.experiments.statistics import holm
 from turgor.fidelity.compare import HERE, SURE, rank_correlation
-from turgor.fidelity.figures import draw_champions, draw_growth, draw_ranks
 from turgor.fidelity.golden import STEPS
 from turgor.fidelity.populations import AGAIN, BOX2D, STARTS, Crossed, Ranked
 from turgor.fidelity.suite import Suite
+from turgor.fidelity.suite_figures import draw_champions, draw_growth, draw_ranks
 from turgor.files import write_whole
 
 NEAR = 0.02  # [1], of a champion's median in Box2D 2.3: the goal on hills
