@@ -72,8 +72,8 @@ def near_segments(x: np.ndarray, task: Task, g: Geometry, skin: float) -> list[t
 
 
 def near_pairs(x: np.ndarray, g: Geometry, skin: float) -> list[tuple[int, int]]:
-    """Pairs of masses a < b that may touch, by b - a, then a: the engine's order. Box2D's hangs on how old contacts are;
-    what controllers are worth does not show which one is taken. The two ends of a spring never touch."""
+    """Pairs of masses a < b that may touch, by b - a, then a: the engine's order. Box2D's hangs on how old contacts
+    are; what controllers are worth does not show which one is taken. The two ends of a spring never touch."""
     # closer than the skin along every face's normal: corners can be further apart
     apart = np.linalg.norm(x[:, None] - x, axis=-1) > g.reach[:, None] + g.reach + np.sqrt(2) * skin
     pairs = [(int(a), int(b)) for a, b in np.argwhere(np.triu(~apart & ~g.bonded))]
