@@ -26,7 +26,7 @@ from turgor.experiments.rows import read_rows
 from turgor.experiments.statistics import median_difference
 from turgor.fidelity import compare
 from turgor.fidelity.campaign import crosscheck_campaign, crosscheck_run
-from turgor.fidelity.compare import Sample, Verdict, crosscheck, kolmogorov_smirnov, rank_correlation
+from turgor.fidelity.compare import MOVED, Sample, Verdict, crosscheck, kolmogorov_smirnov, rank_correlation
 from turgor.fidelity.drive import new_trace, run
 from turgor.fidelity.engines import Crew, make_job
 from turgor.fidelity.figures import draw_run
@@ -185,7 +185,7 @@ def test_a_crosscheck_tells_what_simulators_tell() -> None:
     simulator = Simulator(task)
     here, there, ccd = found.samples
     assert (here.engine, there.engine, ccd.engine) == ("turgor", "box2d", "box2d-ccd")
-    moved = simulator.rollout(np.tile(theta, (4, 1)), perturbed(task.position, 4))
+    moved = simulator.rollout(np.tile(theta, (4, 1)), perturbed(task.position, 4, MOVED))
     assert here.own == simulator.record(theta).fitness == found.recordings["turgor"].fitness
     assert here.fitness == moved.fitness.tolist()
     assert here.ranked == simulator.rollout(ranked).fitness.tolist()
@@ -388,7 +388,7 @@ def test_crosscheck_of_a_run(here: Path, capsys: pytest.CaptureFixture[str]) -> 
         "Box2D 2.3: holds",
     ):
         assert f"\n{word}" in said.out
-    assert "hilly, small, pressure, seed 0: champion of generation 1, from 5 starts moved by 1e-6 m" in said.out
+    assert "hilly, small, pressure, seed 0: champion of generation 1, from 5 starts moved by 0.001 m" in said.out
     out = here / "runs" / "hilly-0" / "crosscheck"
     assert names_in(out) == ["crosscheck.json", *THREE, "replay.html"]
     check_picture(out / "crosscheck.png")

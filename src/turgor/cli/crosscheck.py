@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from turgor.cli.command import Command, Interrupted, Parser, count, whole
+from turgor.cli.command import Command, Interrupted, Parser, count, number, whole
 from turgor.cli.progress import CrosscheckDisplay
 from turgor.cli.words import say
 from turgor.errors import InvalidInput
@@ -23,7 +23,8 @@ SUITE = Path("runs/fidelity")
 def _options(parser: Parser) -> None:
     add = parser.add_argument
     add("path", type=Path, nargs="?", metavar="RUN", help="folder of the run, or of a campaign: all runs below it")
-    add("--repeats", type=count, default=30, metavar="N", help="starts moved by 1e-6 m, at least 2 (default: 30)")
+    add("--repeats", type=count, default=30, metavar="N", help="moved starts, at least 2 (default: 30)")
+    add("--moved", type=number, metavar="X", help="a mass of each start, by so much [m] (default: 0.001)")
     add(
         "--controllers",
         type=whole,
@@ -80,7 +81,7 @@ def _refuse(options: argparse.Namespace, names: Sequence[str], expected: str) ->
 
 def _run(options: argparse.Namespace) -> int | None:
     from turgor.fidelity.campaign import FOLDER, crosscheck_run
-    from turgor.fidelity.compare import CONTROLLERS
+    from turgor.fidelity.compare import CONTROLLERS, MOVED
 
     quiet, out = str(options.json) == "-", options.out or options.path / FOLDER
     with CrosscheckDisplay(quiet=quiet) as display:
@@ -88,6 +89,7 @@ def _run(options: argparse.Namespace) -> int | None:
             options.path,
             out,
             repeats=options.repeats,
+            moved=MOVED if options.moved is None else options.moved,
             controllers=CONTROLLERS if options.controllers is None else options.controllers,
             engines=options.engines,
             seed=options.seed or 0,
@@ -122,7 +124,7 @@ def _tell(record: Record) -> None:
     parts = [first.parts_floor, *(c.parts for c in record.comparisons)]
     after = ["never" if step is None else f"{step * dt:.2f} s" for step in parts]
     lines.append(["1 cm apart", f"{after[0]} (itself)", *after[1:]])
-    starts = f"{record.settings.repeats} starts moved by 1e-6 m"
+    starts = f"{record.settings.repeats} starts moved by {record.settings.moved:g} m"
     say(f"{subject.title}: champion of generation {subject.generation}, from {starts}")
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in lines:
@@ -149,6 +151,7 @@ def _fitness_lines(record: Record) -> list[list[str]]:
 
 def _campaign(options: argparse.Namespace) -> int | None:
     from turgor.fidelity.campaign import FOLDER, crosscheck_campaign
+    from turgor.fidelity.compare import MOVED
 
     quiet, out = str(options.json) == "-", options.out or options.path / FOLDER
     try:
@@ -157,6 +160,7 @@ def _campaign(options: argparse.Namespace) -> int | None:
                 options.path,
                 out,
                 repeats=options.repeats,
+                moved=MOVED if options.moved is None else options.moved,
                 engines=options.engines,
                 processes=options.threads,
                 progress=display,
@@ -216,7 +220,9 @@ def _suite(options: argparse.Namespace) -> None:
         raise InvalidInput(
             "--suite: expected no RUN beside it; --campaign FOLDER says whose champions", str(options.path)
         )
-    _refuse(options, ["controllers", "engines", "seed", "json", "check", "no_replay"], "expected without --suite")
+    _refuse(
+        options, ["moved", "controllers", "engines", "seed", "json", "check", "no_replay"], "expected without --suite"
+    )
     from turgor.fidelity.suite import write_suite
 
     campaign, out = options.campaign or Path("runs/paper"), options.out or SUITE

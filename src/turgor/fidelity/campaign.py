@@ -23,7 +23,16 @@ import numpy as np
 from turgor.errors import InvalidInput, WorkLost
 from turgor.experiments.rows import write_rows
 from turgor.experiments.sheets import write_drawing
-from turgor.fidelity.compare import CONTROLLERS, Case, Crosscheck, controllers_for, crosschecks, engines_for, name_of
+from turgor.fidelity.compare import (
+    CONTROLLERS,
+    MOVED,
+    Case,
+    Crosscheck,
+    controllers_for,
+    crosschecks,
+    engines_for,
+    name_of,
+)
 from turgor.fidelity.engines import Crew, check_engine
 from turgor.fidelity.figures import draw_campaign, draw_run
 from turgor.fidelity.records import (
@@ -71,6 +80,7 @@ def crosscheck_run(
     out: Path | None = None,
     *,
     repeats: int = 30,
+    moved: float = MOVED,
     controllers: int = CONTROLLERS,
     engines: Sequence[str] | None = None,
     seed: int = 0,
@@ -84,10 +94,10 @@ def crosscheck_run(
     champion, names = run.checked_champion(), engines_for(engines)
     case = Case(run.task, champion.theta, controllers_for(run.task, controllers, seed))
     out = path / FOLDER if out is None else out
-    settings = Settings(repeats=repeats, controllers=len(case.ranked), seed=seed, engines=names)
+    settings = Settings(repeats=repeats, moved=moved, controllers=len(case.ranked), seed=seed, engines=names)
     with Crew(processes) as crew, _claimed(out):
         clock = _Clock([case.task], progress)
-        found = next(crosschecks([case], repeats, names, crew, clock.tick))
+        found = next(crosschecks([case], repeats, moved, names, crew, clock.tick))
         record = _record(subject_of(run, path.resolve().name), settings, found)
         again = (out / RESULT).exists()
         write_record(out / RESULT, record)
@@ -145,6 +155,7 @@ def crosscheck_campaign(
     out: Path | None = None,
     *,
     repeats: int = 30,
+    moved: float = MOVED,
     engines: Sequence[str] | None = None,
     processes: int | None = None,
     progress: Show | None = None,
@@ -158,7 +169,7 @@ def crosscheck_campaign(
     `InvalidInput` where there is none at all.
     """
     names = engines_for(engines)
-    settings = Settings(repeats=repeats, controllers=0, seed=0, engines=names)
+    settings = Settings(repeats=repeats, moved=moved, controllers=0, seed=0, engines=names)
     candidates, left_out = _find(folder, names)
     for line in left_out:
         say(f"left out: {line}")
@@ -236,7 +247,7 @@ def _work(
     with Crew(processes) as crew:
         for subject, case in candidates:
             try:
-                found = next(crosschecks([case], settings.repeats, settings.engines, crew, clock.tick))
+                found = next(crosschecks([case], settings.repeats, settings.moved, settings.engines, crew, clock.tick))
             except WorkLost:
                 raise
             except InvalidInput as problem:  # as where an engine loses its numbers

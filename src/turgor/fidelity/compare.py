@@ -31,6 +31,8 @@ HERE = "turgor"
 UNUSUAL = ("box2d-ccd", "box2d-fine")  # compared with where asked for
 CONTROLLERS = 60  # drawn at random, to be ranked, with numbers uniform in [-1, 1]
 MOST_REPEATS = 10_000
+MOVED = 1e-3  # [m], of a start: from 1e-6 m most starts meet the same accident, and a p counts it many times
+CHAOS = 1e-6  # [m], of a start: what chaos makes of next to nothing
 APART = 0.01  # [m], between two positions of a mass: there the trajectories part
 SURE = 0.05  # a difference is told from chance where p is below
 CLOSE = 0.05  # [1], of the fitness: what is as good as the same
@@ -55,7 +57,7 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     engine: str
     version: str
     own: float  # fitness from the task's start
-    fitness: list[float]  # [repeat], from starts moved by 1e-6 m
+    fitness: list[float]  # [repeat], from moved starts
     solved: list[bool] | None  # [repeat]; None: the task has no end
     ranked: list[float]  # [controller], fitness of each from the task's start
 
@@ -108,6 +110,7 @@ def crosscheck(
     theta: ArrayLike,
     repeats: int = 30,
     *,
+    moved: float = MOVED,
     engines: Sequence[str] | None = None,
     controllers: int | ArrayLike = CONTROLLERS,
     seed: int = 0,
@@ -116,8 +119,9 @@ def crosscheck(
 ) -> Crosscheck:
     """A `Crosscheck` of the controller `theta` [parameter]: what it is worth in real Box2D, and what here.
 
-    In every engine it runs from `repeats` starts moved by 1e-6 m, and `controllers` run from the task's own, to be
-    ranked: so many, drawn at random by `seed`, or those of an array [controller, parameter]. `engines` are some of
+    In every engine it runs from `repeats` starts of which one coordinate of one mass is `moved` [m], and `controllers`
+    run from the task's own, to be ranked: so many, drawn at random by `seed`, or those of an array [controller,
+    parameter]. `engines` are some of
     "box2d" (2.3, the paper's), "box2d-ccd" (the same with continuous collision, as the paper's program had it),
     "box2d-fine" (in steps of a quarter of the length) and "box2d-v3"; None: the first and the last, where installed.
     `processes`: None for all cores; then a script has to be guarded by `if __name__ == "__main__"`. The numbers do not
@@ -129,7 +133,7 @@ def crosscheck(
     theta = check_theta(theta, task.body, task.condition, task.controller)[0]
     case = Case(task, theta, controllers_for(task, controllers, seed))
     with Crew(processes) as crew:
-        return next(crosschecks([case], repeats, engines_for(engines), crew, progress))
+        return next(crosschecks([case], repeats, moved, engines_for(engines), crew, progress))
 
 
 def name_of(engine: str) -> str:
@@ -165,6 +169,7 @@ def controllers_for(task: Task, given: int | ArrayLike, seed: int) -> np.ndarray
 def crosschecks(
     cases: Sequence[Case],
     repeats: int,
+    moved: float,
     engines: Sequence[str],
     crew: Crew,
     progress: Callable[[int, int], object] | None = None,
@@ -172,14 +177,16 @@ def crosschecks(
     """A `Crosscheck` of each of `cases` in their order, as soon as it is known. Raises `InvalidInput`."""
     if not isinstance(repeats, int) or not 2 <= repeats <= MOST_REPEATS:
         raise InvalidInput(f"repeats: expected a whole number, 2 to {MOST_REPEATS}", describe(repeats))
+    if not isinstance(moved, int | float) or not 0 < moved <= 1:
+        raise InvalidInput("moved: expected a number of metres, more than 0 and up to 1", describe(moved))
     jobs = []
     for case in cases:
-        agents = _line_up(case, repeats)
+        agents = _line_up(case, repeats, moved)
         jobs += [make_job(engine, case.task, *agents, record=True) for engine in engines]
     answers = crew.run(jobs, progress)
     for case in cases:
         floor = _Floor(case, crew.processes)
-        samples, recordings = [floor.sample(repeats)], {HERE: floor.recording}
+        samples, recordings = [floor.sample(repeats, moved)], {HERE: floor.recording}
         comparisons = []
         for engine in engines:
             done = next(answers)
@@ -190,12 +197,13 @@ def crosschecks(
         yield Crosscheck(samples=samples, comparisons=comparisons, recordings=recordings)
 
 
-def _line_up(case: Case, repeats: int) -> tuple[np.ndarray, np.ndarray]:
+def _line_up(case: Case, repeats: int, moved: float) -> tuple[np.ndarray, np.ndarray]:
     """Theta and starts of a case's agents: the controller from the task's start, then from `repeats` moved ones; then
     the controllers to be ranked."""
     own, ranked = case.task.position[None], len(case.ranked)
     theta = np.concatenate([np.tile(case.theta, (1 + repeats, 1)), case.ranked])
-    return theta, np.concatenate([own, perturbed(case.task.position, repeats), np.repeat(own, ranked, axis=0)])
+    starts = perturbed(case.task.position, repeats, moved)
+    return theta, np.concatenate([own, starts, np.repeat(own, ranked, axis=0)])
 
 
 def _sample(engine: str, version: str, task: Task, out: Rollout, repeats: int) -> Sample:
@@ -216,13 +224,13 @@ class _Floor:
 
     def __init__(self, case: Case, threads: int) -> None:
         self.case, self.simulator = case, Simulator(case.task, threads=threads)
-        moved = perturbed(case.task.position, max(len(case.ranked), 1))
+        moved = perturbed(case.task.position, max(len(case.ranked), 1), CHAOS)
         self.recording = self.simulator.record(case.theta)
         self.parts = first_apart(self.recording, self.simulator.record(case.theta, moved[0]))
         self.again = self.simulator.rollout(case.ranked, moved[: len(case.ranked)]).fitness
 
-    def sample(self, repeats: int) -> Sample:
-        out = self.simulator.rollout(*_line_up(self.case, repeats))
+    def sample(self, repeats: int, moved: float) -> Sample:
+        out = self.simulator.rollout(*_line_up(self.case, repeats, moved))
         return _sample(HERE, turgor.__version__, self.case.task, out, repeats)
 
 

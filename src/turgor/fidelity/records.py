@@ -44,7 +44,8 @@ class Subject(msgspec.Struct, frozen=True, kw_only=True):
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
     """How it is crosschecked."""
 
-    repeats: int  # starts moved by 1e-6 m, as `turgor.perturbed` makes them
+    repeats: int  # moved starts, as `turgor.perturbed` makes them
+    moved: float  # [m], by so much
     controllers: int  # that are ranked: numbers uniform in [-1, 1] from NumPy's default generator
     seed: int  # of these
     engines: list[str]
