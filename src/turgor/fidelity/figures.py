@@ -56,7 +56,8 @@ def draw_run(record: Record, scene: Scene, recordings: Mapping[str, Recording]) 
         says = [f"{name_of(c.engine)}: {c.says}" for c in record.comparisons]
         figure.suptitle("\n".join([record.subject.title, *says]), x=0.01, ha="left", fontsize=8.5)
     caption = (
-        f"Top left: fitness from {record.settings.repeats} starts moved by {record.settings.moved:g} m (points, from top to bottom the same "
+        f"Top left: fitness from {record.settings.repeats} starts moved by {record.settings.moved:g} m (points, "
+        "from top to bottom the same "
         "starts), quartiles and median (box, line), and from the task's own start (diamond). Top right: fitness of "
         f"{len(record.samples[0].ranked)} random controllers. Middle: the centre of mass over time from the task's own "
         "start; vertical: from there on a mass is 1 cm apart. Bottom: its path; one scale for both axes."

@@ -10,7 +10,7 @@ from turgor.experiments.sheets import GREY, INK, PALE, make_sheet, paper_style
 from turgor.fidelity.compare import HERE, name_of
 from turgor.fidelity.figures import LOOKS
 from turgor.fidelity.golden import Growth
-from turgor.fidelity.populations import AGAIN, BOX2D, Crossed, Ranked
+from turgor.fidelity.populations import AGAIN, BOX2D, WIDE, Crossed, Ranked
 from turgor.files import whole
 
 SCENES = {"free": "free flight", "flat": "plane", "hills": "hills", "cage": "cage", "gas": "gas law, plane"}
@@ -81,7 +81,7 @@ def draw_champions(rows: Sequence[Crossed], path: Path) -> None:
         figure = make_sheet(3.6)
         panels = figure.subplots(1, 2)
         for axes, task in zip(panels, ("hilly", "escape"), strict=True):
-            mine = [row for row in rows if row.task == task and not row.engine.endswith(AGAIN)]
+            mine = [r for r in rows if (r.task, r.moved) == (task, WIDE) and not r.engine.endswith(AGAIN)]
             low, high = (f([v for r in mine for v in (r.box2d, r.median)]) for f in (min, max))
             edge = 0.06 * (high - low)
             axes.plot([low - edge, high + edge], [low - edge, high + edge], color=PALE, zorder=0)
