@@ -2,7 +2,7 @@
 
 A fresh Box2D world remembers no impulses and no age of its contacts, so that the order in which it solves them is known
 from how it was made. In that order the reference has to do what Box2D does, to float rounding: all that is left to
-differ in a trajectory is the order, which in Box2D hangs on the past (docs/fidelity.md).
+differ in a trajectory is the order, which in Box2D hangs on the past (docs/crosscheck.md).
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ def _moved(task: Task) -> np.ndarray:
 
 
 def champions(campaign: Path) -> Iterator[tuple[Entry, Task, np.ndarray]]:
-    """Entry, task and theta of every champion of the paper preset in the folder `campaign`, on hills and in the cage."""
+    """Entry, task and theta of every champion of the paper preset in `campaign`, on hills and in the cage."""
     for task, body, condition in random_cells():
         for path in sorted(campaign.glob(f"{task}-{body}-{condition}-s*/run.json")):
             run = Run.open(path.parent)

@@ -155,7 +155,7 @@ def _inside(rows: Sequence[Crossed]) -> str:
 
 def _short_engine(suite: Suite, engine: str) -> tuple[str, str, str, str]:
     kept = [row.median / row.box2d for row in _of(suite.champions, engine, "hilly", WIDE) if row.box2d > FAST]
-    told = f"{np.median(kept):.0%} ({min(kept):.0%} to {max(kept):.0%})"
+    told = f"{np.median(kept):.0%} ({min(kept):.0%} to {max(kept):.0%})" if kept else "none is as fast"
     return f"Champions faster than {FAST:g} m/s on hills: what they keep in {_names(suite)[engine]}", "told", told, ""
 
 
