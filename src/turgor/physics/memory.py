@@ -31,29 +31,32 @@ BYTES = 4  # of a float32 and an int32
 
 
 class Width(int):
-    """The number of lanes as an argument of a kernel. It is part of the argument's type, and so is `build`.
+    """The number of lanes as an argument of a kernel. It is part of the argument's type, and so are `build` and
+    `stride`: how many agents stand side by side in memory, one value of lanes after the other; None for `width`.
 
     Numba's disk cache knows a compiled kernel by its argument types alone, and sees neither a changed global
     nor a changed function in another file: a different `width` or `build` makes it compile anew.
     """
 
     build: str
+    stride: int
 
-    def __new__(cls, width: int, build: str = "") -> Width:
+    def __new__(cls, width: int, build: str = "", stride: int | None = None) -> Width:
         self = super().__new__(cls, width)
         self.build = build
+        self.stride = stride or width
         return self
 
 
 class WidthType(types.Type):
-    def __init__(self, width: int, build: str) -> None:
-        self.width, self.build = width, build
-        super().__init__(f"Width({width}, {build})")
+    def __init__(self, width: int, build: str, stride: int) -> None:
+        self.width, self.build, self.stride = width, build, stride
+        super().__init__(f"Width({width}, {build}, {stride})")
 
 
 @typeof_impl.register(Width)
 def _type_of_width(value: Width, context: Any) -> WidthType:
-    return WidthType(int(value), value.build)
+    return WidthType(int(value), value.build, value.stride)
 
 
 @register_model(WidthType)
@@ -76,14 +79,25 @@ def lane_count(typingctx: Any, width: Any) -> Any:
     return types.intp(width), emit
 
 
-class View(types.Type):
-    """A pointer to numbers of one kind: rows of `width` lanes, or (width None) one number each."""
+@intrinsic
+def agents_abreast(typingctx: Any, width: Any) -> Any:
+    """How many agents stand side by side in memory, as an int."""
 
-    def __init__(self, kind: str, width: int | None) -> None:
-        self.kind, self.width = kind, width
+    def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        return ir.Constant(ir.IntType(64), width.stride)
+
+    return types.intp(width), emit
+
+
+class View(types.Type):
+    """A pointer to numbers of one kind: rows of `width` lanes, or (width None) one number each. From one to the next
+    it is `stride` numbers."""
+
+    def __init__(self, kind: str, width: int | None, stride: int) -> None:
+        self.kind, self.width, self.stride = kind, width, stride
         self.element = SCALAR[kind]
         self.row = self.element if width is None else Lanes(kind, width)
-        super().__init__(f"view({kind}, {width})")
+        super().__init__(f"view({kind}, {width}, {stride})")
 
 
 @register_model(View)
@@ -118,15 +132,15 @@ class _Set(AbstractTemplate):
 
 
 def _row_pointer(builder: Any, view: View, pointer: Any, index: Any) -> Any:
-    if view.width is None:
-        return builder.gep(pointer, [index])
-    first = builder.gep(pointer, [builder.mul(index, index.type(view.width))])
-    return builder.bitcast(first, Lanes(view.kind, view.width).llvm.as_pointer())
+    if view.stride != 1:
+        index = builder.mul(index, index.type(view.stride))
+    first = builder.gep(pointer, [index])
+    return first if view.width is None else builder.bitcast(first, Lanes(view.kind, view.width).llvm.as_pointer())
 
 
 def _number_pointer(builder: Any, view: View, pointer: Any, index: Any) -> Any:
     row, lane = cgutils.unpack_tuple(builder, index)
-    return builder.gep(pointer, [builder.add(builder.mul(row, row.type(view.width)), lane)])
+    return builder.gep(pointer, [builder.add(builder.mul(row, row.type(view.stride)), lane)])
 
 
 def _alignment(view: View) -> int:
@@ -205,12 +219,15 @@ def fields(views: type) -> dict[str, tuple[type, str]]:
     return {name: get_args(hints[name]) for name in views._fields}  # ty: ignore[missing-attribute]
 
 
-def layout(views: type, lengths: Mapping[str, int], width: int) -> np.ndarray:
-    """Offsets of the fields in a buffer of float32 [4 byte], and at the end its size; each on a cache line."""
+def layout(views: type, lengths: Mapping[str, int], width: int, shared_by: int | None = None) -> np.ndarray:
+    """Offsets of the fields in a buffer of float32 [4 byte], and at the end its size; each on a cache line.
+
+    Rows are `width` agents wide; a number of a table is shared by `shared_by` of them, None for all.
+    """
     offsets, at = [], 0
     for annotation, length in fields(views).values():
         offsets.append(at)
-        size = lengths[length] * (width if FIELD[annotation][1] else 1)
+        size = lengths[length] * (width if FIELD[annotation][1] else width // (shared_by or width))
         at += -(-size // (LINE // BYTES)) * (LINE // BYTES)
     return np.array([*offsets, at], dtype=np.int64)
 
@@ -236,22 +253,54 @@ def field_of(
 
 @intrinsic
 def views(typingctx: Any, cls: Any, buffer: Any, offsets: Any, width: Any) -> Any:
-    """A NamedTuple `cls` of views into the float32 array `buffer` [size], at `offsets` (see `layout`)."""
+    """A NamedTuple `cls` of views into the float32 array `buffer` [size], at `offsets` (see `layout`): of all lanes of
+    a block, or of tables that all blocks share."""
     made = [
-        View(FIELD[annotation][0], width.width if FIELD[annotation][1] else None)
-        for annotation, _ in fields(cls.instance_class).values()
+        View(kind, width.width, width.width) if in_lanes else View(kind, None, 1) for kind, in_lanes in _kinds_of(cls)
     ]
-    result = types.NamedTuple(made, cls.instance_class)
-    if len(set(made)) == 1:
-        result = types.NamedUniTuple(made[0], len(made), cls.instance_class)
+    result = _tuple_of(cls, made)
 
     def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-        data = cgutils.create_struct_proxy(buffer)(context, builder, values[1]).data
-        at = cgutils.create_struct_proxy(offsets)(context, builder, values[2]).data
-        pointers = []
-        for k, view in enumerate(made):
-            offset = builder.load(builder.gep(at, [ir.IntType(64)(k)]))
-            pointers.append(builder.bitcast(builder.gep(data, [offset]), ELEMENT[view.kind].as_pointer()))
-        return context.make_tuple(builder, result, pointers)
+        zero = ir.IntType(64)(0)
+        return context.make_tuple(builder, result, _pointers(context, builder, sig, values, made, zero))
 
     return result(cls, buffer, offsets, width), emit
+
+
+@intrinsic
+def lane_views(typingctx: Any, cls: Any, buffer: Any, offsets: Any, width: Any, lane: Any) -> Any:
+    """The same of one lane alone, in a block of `width.stride` agents: what the lanes of `views` share is its own."""
+    made = [View(kind, 1 if in_lanes else None, width.stride) for kind, in_lanes in _kinds_of(cls)]
+    result = _tuple_of(cls, made)
+
+    def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        first = context.cast(builder, values[4], lane, types.int64)
+        return context.make_tuple(builder, result, _pointers(context, builder, sig, values, made, first))
+
+    return result(cls, buffer, offsets, width, lane), emit
+
+
+def _kinds_of(cls: Any) -> list[tuple[str, bool]]:
+    return [FIELD[annotation] for annotation, _ in fields(cls.instance_class).values()]
+
+
+def _tuple_of(cls: Any, made: list[View]) -> types.Type:
+    if len(set(made)) == 1:
+        return types.NamedUniTuple(made[0], len(made), cls.instance_class)
+    return types.NamedTuple(made, cls.instance_class)
+
+
+def _pointers(context: Any, builder: Any, sig: Any, values: Any, made: list[View], first: Any) -> list[ir.Value]:
+    """Where each field begins, `first` numbers behind the block's own beginning."""
+    _, buffer, offsets, *_ = sig.args
+    data = cgutils.create_struct_proxy(buffer)(context, builder, values[1]).data
+    pointers = []
+    for k, view in enumerate(made):
+        if isinstance(offsets, types.BaseTuple):  # numbers of the call, not of the memory
+            offset = context.cast(builder, builder.extract_value(values[2], k), offsets[k], types.int64)
+        else:
+            at = cgutils.create_struct_proxy(offsets)(context, builder, values[2]).data
+            offset = builder.load(builder.gep(at, [ir.IntType(64)(k)]))
+        place = builder.gep(data, [builder.add(offset, first)])
+        pointers.append(builder.bitcast(place, ELEMENT[view.kind].as_pointer()))
+    return pointers

@@ -10,7 +10,7 @@ from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, fi
 from turgor.physics.control import control
 from turgor.physics.lanes import any_lane, rare, select, stage
 from turgor.physics.manifold import NO_ID
-from turgor.physics.memory import lane_count, views
+from turgor.physics.memory import agents_abreast, lane_count, lane_views, views
 from turgor.physics.model import (
     COMMANDS,
     CONTROLLER,
@@ -180,6 +180,30 @@ def hand_out(settings, model, state, work, result, observations, stands, first):
         stands[agent, 5 * n + 2 * settings.chambers] = result.solved[0, lane]
 
 
+@stage
+def run_block(
+    settings, model, ground, state, work, brain, result, script, trace, recording, fresh, position, velocity, commands,
+    observations, stands, drive, first, first_step, steps, last_step,
+):  # fmt: skip
+    """Runs the block of agents `first` ...: see `run_blocks`."""
+    row = 0
+    if len(fresh) > 0:
+        begin(settings, model, state, work, result, fresh, position, velocity, first, first_step)
+        if recording:
+            record(settings, state, work, trace, row)
+            row += 1
+    for k in range(steps):
+        t = first_step + k
+        step(settings, model, ground, state, work, brain, script, commands, drive, first, t, k)
+        if recording:
+            record(settings, state, work, trace, row)
+            row += 1
+        if note_end(settings, model, state, result, t, t == last_step):
+            break
+    if len(observations) > 0:
+        hand_out(settings, model, state, work, result, observations, stands, first)
+
+
 def _run_blocks(
     width, settings, tables, grounds, memory, brains, scripts, traces, results, layouts, fresh, position, velocity,
     commands, observations, stands, drive, first_step, steps, last_step,
@@ -192,32 +216,40 @@ def _run_blocks(
     `observations`, `stands` if there is room for them.
     """
     model = views(Model, tables, layouts[0], width)
-    recording = traces.shape[1] > 0
+    script = views(Script, scripts[0], layouts[6], width)
+    trace = views(Trace, traces[0], layouts[6], width)
     for block in range(len(memory)):
         ground = views(Ground, grounds[block if settings.own_ground != 0 else 0], layouts[1], width)
         state = views(State, memory[block], layouts[2], width)
         work = views(Work, memory[block], layouts[3], width)
         brain = views(Brain, brains[block], layouts[4], width)
         result = views(Result, results[block], layouts[5], width)
-        script = views(Script, scripts[0], layouts[6], width)
-        trace = views(Trace, traces[0], layouts[6], width)
-        first = block * lane_count(width)
-        row = 0
-        if len(fresh) > 0:
-            begin(settings, model, state, work, result, fresh, position, velocity, first, first_step)
-            if recording:
-                record(settings, state, work, trace, row)
-                row += 1
-        for k in range(steps):
-            t = first_step + k
-            step(settings, model, ground, state, work, brain, script, commands, drive, first, t, k)
-            if recording:
-                record(settings, state, work, trace, row)
-                row += 1
-            if note_end(settings, model, state, result, t, t == last_step):
-                break
-        if len(observations) > 0:
-            hand_out(settings, model, state, work, result, observations, stands, first)
+        run_block(
+            settings, model, ground, state, work, brain, result, script, trace, traces.shape[1] > 0, fresh, position,
+            velocity, commands, observations, stands, drive, block * lane_count(width), first_step, steps, last_step,
+        )  # fmt: skip
+
+
+@stage
+def run_agent(
+    agent, width, settings, tables, grounds, memory, brains, scripts, traces, results, layouts, fresh, position,
+    velocity, commands, observations, stands, drive, first_step, steps, last_step,
+):  # fmt: skip
+    """The same for one `agent` alone, with a `width` of one lane: what a thread of a GPU does."""
+    block = agent // agents_abreast(width)
+    lane = agent % agents_abreast(width)
+    model = views(Model, tables, layouts[0], width)
+    ground = views(Ground, grounds[0], layouts[1], width)
+    state = lane_views(State, memory[block], layouts[2], width, lane)
+    work = lane_views(Work, memory[block], layouts[3], width, lane)
+    brain = lane_views(Brain, brains[block], layouts[4], width, lane)
+    result = lane_views(Result, results[block], layouts[5], width, lane)
+    script = lane_views(Script, scripts[0], layouts[6], width, lane)
+    trace = lane_views(Trace, traces[0], layouts[6], width, lane)
+    run_block(
+        settings, model, ground, state, work, brain, result, script, trace, traces.shape[1] > 0, fresh, position,
+        velocity, commands, observations, stands, drive, agent, first_step, steps, last_step,
+    )  # fmt: skip
 
 
 # The cache knows `width`, and through it the sources of all that is called here: see memory.Width. Where no folder can
