@@ -164,7 +164,21 @@ for _operator, _float, _int in (("add", "fadd", "add"), ("sub", "fsub", "sub"), 
         _define(getattr(operator, _prefix + _operator), NUMBERS, _instruction(_float, _int))
 for _function in (operator.truediv, operator.itruediv):
     _define(_function, ("float",), lambda builder, lanes, a, b: builder.fdiv(a, b))
-_define(operator.neg, ("float",), lambda builder, lanes, a: builder.fneg(a), arguments=1)
+
+
+def _negative(builder: Any, lanes: Lanes, a: Any) -> Any:
+    # one lane may be a GPU's, and NVVM knows neither fneg nor llvm.fabs
+    return builder.fsub(ir.Constant(lanes.llvm, -0.0), a) if lanes.width == 1 else builder.fneg(a)
+
+
+def _without_sign(builder: Any, lanes: Lanes, a: Any) -> Any:
+    if lanes.width > 1:
+        return _llvm_function("fabs")(builder, lanes, a)
+    bits = builder.bitcast(a, ir.IntType(32))
+    return builder.bitcast(builder.and_(bits, bits.type(0x7FFFFFFF)), lanes.llvm)
+
+
+_define(operator.neg, ("float",), _negative, arguments=1)
 for _function, _symbol in (
     (operator.lt, "<"),
     (operator.gt, ">"),
@@ -181,7 +195,7 @@ _define(operator.invert, ("mask",), lambda builder, lanes, a: builder.not_(a), a
 # As the vector units do it: the second operand where the comparison does not hold, NaN included.
 _define(min, ("float",), lambda b, lanes, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
 _define(max, ("float",), lambda b, lanes, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))
-_define(abs, ("float",), _llvm_function("fabs"), arguments=1)
+_define(abs, ("float",), _without_sign, arguments=1)
 _define(math.sqrt, ("float",), _llvm_function("sqrt"), arguments=1)
 
 
