@@ -18,7 +18,7 @@ from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, roo
 from turgor.physics.memory import BYTES, LINE, MOST_TRACE_BYTES, Width, aligned, check_memory, fields
 from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
 from turgor.physics.step import run_blocks
-from turgor.physics.tables import ground_tables, make_kernel, write_ground
+from turgor.physics.tables import ON_CPU, ground_tables, make_kernel, write_ground
 from turgor.scene import Scene
 from turgor.task import Task
 
@@ -32,10 +32,10 @@ _SPARE = 0.15  # room for scenes that are a little larger than those seen
 class World:
     """A task as the kernel sees it, with its one scene: what the batches of a simulator share."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, width: Width = ON_CPU) -> None:
         self.task = task
         columns = self.cut(task.scene)
-        self.kernel = make_kernel(task, room_for([columns]))
+        self.kernel = make_kernel(task, room_for([columns]), width=width)
         self.grounds = aligned(1, self.kernel.size(Ground))
         write_ground(ground_tables(self.kernel, self.grounds[0]), columns)
 
@@ -69,7 +69,7 @@ class Batch:
 
     @property
     def blocks(self) -> int:
-        return -(-self.agents // WIDTH)
+        return -(-self.agents // self.kernel.abreast)
 
     @property
     def own_scenes(self) -> bool:
@@ -77,20 +77,20 @@ class Batch:
 
     def think(self, theta: np.ndarray) -> None:
         """Gives the agents their controllers, `theta` [agent, parameter]."""
-        task = self._task
+        task, abreast = self._task, self.kernel.abreast
         weights, biases = pack(theta, task.body, task.condition, task.controller, task.physics.dt)
-        lanes = np.minimum(np.arange(self.blocks * WIDTH), self.agents - 1)  # the last agent in lanes left over
-        for brain, agents in zip(self.brains, lanes.reshape(-1, WIDTH), strict=True):
+        lanes = np.minimum(np.arange(self.blocks * abreast), self.agents - 1)  # the last agent in lanes left over
+        for brain, agents in zip(self.brains, lanes.reshape(-1, abreast), strict=True):
             self.kernel.field(brain, Brain, "weight")[:] = weights[agents].T
             self.kernel.field(brain, Brain, "bias")[:] = biases[agents].T
 
     def trace(self, steps: int) -> np.ndarray:
         """Room for a recording of the first block, float32 [step + 1, row, lane]. Raises `InvalidInput` for more steps
         than can be recorded."""
-        body = self.kernel.lengths
+        body, abreast = self.kernel.lengths, self.kernel.abreast
         row = 5 * body["mass"] + body["spring"] + body["chamber"] + body["input"]
-        check_memory("steps: expected fewer to be recorded", BYTES * WIDTH * row * (steps + 1), MOST_TRACE_BYTES)
-        return aligned(steps + 1, row * WIDTH).reshape(steps + 1, row, WIDTH)
+        check_memory("steps: expected fewer to be recorded", BYTES * abreast * row * (steps + 1), MOST_TRACE_BYTES)
+        return aligned(steps + 1, row * abreast).reshape(steps + 1, row, abreast)
 
     def run(
         self,
@@ -113,17 +113,24 @@ class Batch:
         """
         scripts = _NO_SCRIPT
         if script is not None:
-            scripts = aligned(1, script.size * WIDTH)
-            scripts[0] = np.repeat(script.ravel(), WIDTH)
+            scripts = aligned(1, script.size * self.kernel.abreast)
+            scripts[0] = np.repeat(script.ravel(), self.kernel.abreast)
         traces = _NO_TRACE if trace is None else trace.reshape(1, -1)
         assert traces.ctypes.data % LINE == 0 or not traces.size  # the kernel moves whole cache lines
+        self._call(scripts, traces, fresh, commands, observations, stands, drive, steps, last)
+        self.steps += steps
+
+    def _call(
+        self, scripts: np.ndarray, traces: np.ndarray, fresh: np.ndarray, commands: np.ndarray,
+        observations: np.ndarray, stands: np.ndarray, drive: int, steps: int, last: int,
+    ) -> None:  # fmt: skip
+        """Calls the kernel."""
         kernel = self.kernel
         run_blocks(
             _width(), kernel.settings, kernel.tables, self._grounds, self.memory, self.brains, scripts, traces,
             self.results, kernel.layouts, fresh, self.position, self.velocity, commands, observations, stands,
             drive, self.steps, steps, last,
         )  # fmt: skip
-        self.steps += steps
 
     def begin(self, drive: int = CONTROLLER, **outputs: Any) -> None:
         """Puts all agents at the start."""

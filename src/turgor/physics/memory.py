@@ -219,15 +219,16 @@ def fields(views: type) -> dict[str, tuple[type, str]]:
     return {name: get_args(hints[name]) for name in views._fields}  # ty: ignore[missing-attribute]
 
 
-def layout(views: type, lengths: Mapping[str, int], width: int, shared_by: int | None = None) -> np.ndarray:
+def layout(views: type, lengths: Mapping[str, int], width: int, lanes: int | None = None) -> np.ndarray:
     """Offsets of the fields in a buffer of float32 [4 byte], and at the end its size; each on a cache line.
 
-    Rows are `width` agents wide; a number of a table is shared by `shared_by` of them, None for all.
+    Rows are `width` agents wide. A number of a table is shared by as many as are `lanes` of one value, None for all.
     """
+    tables = max(1, width // (lanes or width))
     offsets, at = [], 0
     for annotation, length in fields(views).values():
         offsets.append(at)
-        size = lengths[length] * (width if FIELD[annotation][1] else width // (shared_by or width))
+        size = lengths[length] * (width if FIELD[annotation][1] else tables)
         at += -(-size // (LINE // BYTES)) * (LINE // BYTES)
     return np.array([*offsets, at], dtype=np.int64)
 
