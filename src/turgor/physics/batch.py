@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -63,9 +64,12 @@ class Batch:
         else:
             self._make_room(room_for(self._scenes, _SPARE))
             self._write_scenes(range(self.agents))
-        self.memory = aligned(self.blocks, self.kernel.size(State))
+        self._make_memory()
         self.brains = aligned(self.blocks, self.kernel.size(Brain))
         self.results = aligned(self.blocks, self.kernel.size(Result))
+
+    def _make_memory(self) -> None:
+        self.memory = aligned(self.blocks, self.kernel.size(State))
 
     @property
     def blocks(self) -> int:
@@ -219,22 +223,35 @@ class Batch:
 
 
 @lru_cache
+def build_of_sources() -> str:
+    """A hash of the engine's sources."""
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:12]
+
+
+@lru_cache
 def _width() -> Width:
     """The kernel's width, marked with its sources."""
-    sources = sorted(Path(__file__).parent.glob("*.py"))
-    return Width(WIDTH, hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:12])
+    return Width(WIDTH, build_of_sources())
 
 
 @lru_cache
 def load_kernel() -> None:
     """Has the kernel ready, compiled or from the cache; says so if that takes a while."""
-    said = "turgor: compiling the engine for this processor, once ..."
+    body = Body([[0.0, 0.0]])
+    task = Task(name="nothing", body=body, scene=Scene([]), position=body.position, condition="passive")
+    with notice_of_compilation("processor"):
+        Batch(World(task), np.zeros((0, 1, 2))).run(CONTROLLER, 0, 0)
+
+
+@contextmanager
+def notice_of_compilation(what: str) -> Iterator[None]:
+    """Says so if what happens here takes a while."""
+    said = f"turgor: compiling the engine for this {what}, once ..."
     notice = threading.Timer(1.5, print, [said], {"file": sys.stderr, "flush": True})
     notice.daemon = True
     notice.start()
-    body = Body([[0.0, 0.0]])
-    task = Task(name="nothing", body=body, scene=Scene([]), position=body.position, condition="passive")
     try:
-        Batch(World(task), np.zeros((0, 1, 2))).run(CONTROLLER, 0, 0)
+        yield
     finally:
         notice.cancel()
