@@ -338,8 +338,8 @@ class Machine:
         self.compute_capability = compute_capability
         self.launches = 0
 
-    def load(self, program: object) -> None:
-        self.kernel = Kernel(program.ptx)
+    def load(self, ptx: str) -> None:
+        self.kernel = Kernel(ptx)
 
     def free_bytes(self) -> int:
         return 2**30

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import re
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from cuda.bindings import driver
@@ -35,20 +35,6 @@ class Memory:
             self._free(self.address)
 
 
-class Program(NamedTuple):
-    """The engine, compiled for a GPU."""
-
-    ptx: str  # "" where it comes from the cache
-    cubin: bytes
-
-    @property
-    def entry(self) -> bytes:
-        """The name of its kernel, which alone has such a section."""
-        found = re.search(rb"\0\.nv\.constant0\.(\w+)\0", self.cubin)
-        assert found is not None
-        return found[1]
-
-
 class Device:
     """A GPU. Raises `InvalidInput` where there is none, or where it fails."""
 
@@ -65,14 +51,12 @@ class Device:
         )
         self.name = _ask(driver.cuDeviceGetName(128, self._device)).split(b"\0")[0].decode()
         self._context = _ask(driver.cuDevicePrimaryCtxRetain(self._device))
-        self._kernel: Any = None
 
-    def load(self, program: Program) -> None:
-        """Has the kernel of `program` ready."""
+    def load(self, code: bytes) -> None:
+        """Has the one kernel of this machine code ready."""
         self._enter()
-        if self._kernel is None:
-            self._module = _ask(driver.cuModuleLoadData(program.cubin))
-            self._kernel = _ask(driver.cuModuleGetFunction(self._module, program.entry))
+        self._module = _ask(driver.cuModuleLoadData(code))
+        self._kernel = _ask(driver.cuModuleGetFunction(self._module, entry_of(code)))
 
     def free_bytes(self) -> int:
         self._enter()
@@ -121,6 +105,13 @@ class Device:
     def _enter(self) -> None:
         """Makes this the device of the calling thread."""
         _ask(driver.cuCtxSetCurrent(self._context))
+
+
+def entry_of(code: bytes) -> bytes:
+    """The name of the kernel, which alone has a section of such a name."""
+    found = re.search(rb"\0\.nv\.constant0\.(\w+)\0", code)
+    assert found is not None
+    return found[1]
 
 
 def flat(array: Memory) -> list[Argument]:

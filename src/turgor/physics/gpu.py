@@ -10,8 +10,9 @@ approximated or flushed to zero: the bits are meant to be those of the CPU.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -19,12 +20,14 @@ from types import SimpleNamespace
 from typing import get_type_hints
 
 import numpy as np
+from cuda import pathfinder
+from cuda.core import Linker, LinkerOptions, ObjectCode
 from numba import cuda, typeof, types
 from numba.cuda import compiler, dispatcher
 from numba.cuda.cudadrv import nvvm
 
 from turgor.physics.batch import Batch, World, build_of_sources, notice_of_compilation
-from turgor.physics.driver import Argument, Device, Memory, Program, flat
+from turgor.physics.driver import Argument, Device, Memory, flat
 from turgor.physics.memory import BYTES, Width, fields
 from turgor.physics.model import VIEWS, Brain, Settings, State
 from turgor.physics.step import run_agent, run_blocks
@@ -69,15 +72,25 @@ def signature() -> tuple[types.Type, ...]:
     )  # fmt: skip
 
 
-def compile_for(compute_capability: tuple[int, int]) -> Program:
-    """The engine for GPUs of a `compute_capability`, say (9, 0). Needs no GPU."""
+def compile_for(compute_capability: tuple[int, int]) -> str:
+    """The engine as PTX for GPUs of a `compute_capability`, say (9, 0). Needs no GPU."""
     with _as_if_on(compute_capability):
         made = compiler.compile_cuda(run_agents, types.void, signature(), nvvm_options=OPTIONS, cc=compute_capability)
     kernel = made.library.get_function(made.fndesc.llvm_func_name)
     compiler.kernel_fixup(kernel, False)
     nvvm.set_launch_bounds(kernel, (THREADS, BLOCKS))
-    ptx = made.library.get_asm_str(compute_capability)
-    return Program(ptx, made.library.get_cubin(compute_capability).code)
+    unit = nvvm.CompilationUnit({**OPTIONS, "arch": "compute_{}{}".format(*compute_capability)})
+    for module in made.library.llvm_strs:
+        unit.add_module(nvvm.llvm_replace(module).encode())
+    unit.verify()
+    unit.lazy_add_module(Path(pathfinder.find_bitcode_lib("device")).read_bytes())  # abs of a single number
+    return unit.compile().decode().rstrip("\0")
+
+
+def assemble(ptx: str, compute_capability: tuple[int, int]) -> bytes:
+    """The machine code of `ptx`. Needs no GPU either."""
+    options = LinkerOptions(arch="sm_{}{}".format(*compute_capability))
+    return Linker(ObjectCode.from_ptx(ptx.encode()), options=options).link("cubin").code
 
 
 @contextmanager
@@ -93,29 +106,28 @@ def _as_if_on(compute_capability: tuple[int, int]) -> Iterator[None]:
 
 
 @lru_cache
-def program_for(compute_capability: tuple[int, int]) -> Program:
-    """The same, from the cache if it is there: beside the CPU's kernel."""
-    folder = run_blocks.stats.cache_path
-    if folder is None:
-        with notice_of_compilation("GPU"):
-            return compile_for(compute_capability)
+def machine_code_for(compute_capability: tuple[int, int]) -> bytes:
+    """The engine for GPUs of a `compute_capability`, compiled or from the cache, beside the CPU's kernel."""
     start = "engine-sm_{}{}".format(*compute_capability)
-    file = Path(folder) / f"{start}-{build_of_sources()}-{version('numba-cuda')}.cubin"
-    try:
-        return Program("", file.read_bytes())
-    except OSError:
-        with notice_of_compilation("GPU"):
-            made = compile_for(compute_capability)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        for old in file.parent.glob(f"{start}-*.cubin"):
+    name = f"{start}-{build_of_sources()}-{version('numba-cuda')}.cubin"
+    folder = run_blocks.stats.cache_path and Path(run_blocks.stats.cache_path)
+    if folder and (folder / name).exists():
+        return (folder / name).read_bytes()
+    with notice_of_compilation("GPU"):
+        code = assemble(compile_for(compute_capability), compute_capability)
+    if folder:
+        _keep(code, folder / name, folder.glob(f"{start}-*.cubin"))
+    return code
+
+
+def _keep(code: bytes, file: Path, older: Iterable[Path]) -> None:
+    """Puts the code into the cache in place of `older` ones; where that is not possible, it is compiled again."""
+    with suppress(OSError):
+        for old in list(older):
             old.unlink()
-        unfinished = file.with_suffix(".part")
-        unfinished.write_bytes(made.cubin)
+        unfinished = file.with_suffix(f".{os.getpid()}.part")
+        unfinished.write_bytes(code)
         unfinished.replace(file)
-    except OSError:
-        pass  # compiled again next time
-    return made
 
 
 class Gpu:
@@ -123,7 +135,7 @@ class Gpu:
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        device.load(program_for(device.compute_capability))
+        device.load(machine_code_for(device.compute_capability))
 
     def __repr__(self) -> str:
         return f"Gpu({self._device.name})"
