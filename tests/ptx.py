@@ -123,7 +123,9 @@ class Kernel:
         kind = place.type.pointee
         if value.type != kind:
             if isinstance(value.type, ir.IntType) and isinstance(kind, ir.IntType):
-                value = self.builder.zext(value, kind) if value.type.width < kind.width else self.builder.trunc(value, kind)
+                value = (
+                    self.builder.zext(value, kind) if value.type.width < kind.width else self.builder.trunc(value, kind)
+                )
             else:
                 value = self.builder.bitcast(value, kind)
         self.builder.store(value, place)
@@ -136,7 +138,9 @@ class Kernel:
             if value.type == kind:
                 return value
             if isinstance(kind, ir.IntType) and isinstance(value.type, ir.IntType):
-                return self.builder.trunc(value, kind) if kind.width < value.type.width else self.builder.zext(value, kind)
+                return (
+                    self.builder.trunc(value, kind) if kind.width < value.type.width else self.builder.zext(value, kind)
+                )
             return self.builder.bitcast(value, kind)
         if operand.startswith("0f"):
             return self.builder.bitcast(I32(int(operand[2:], 16)), F32)
@@ -250,7 +254,9 @@ class Kernel:
         ordered = build.select(
             build.fcmp_ordered(symbol, a, b), a, build.select(build.fcmp_ordered("==", a, b), same, b)
         )
-        return build.select(build.fcmp_unordered("uno", a, a), b, build.select(build.fcmp_unordered("uno", b, b), a, ordered))
+        return build.select(
+            build.fcmp_unordered("uno", a, a), b, build.select(build.fcmp_unordered("uno", b, b), a, ordered)
+        )
 
     def _setp(self, kinds: list[str], operands: list[str]) -> ir.Value:
         comparison, kind = kinds

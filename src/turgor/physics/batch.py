@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -245,7 +245,7 @@ def load_kernel() -> None:
 
 
 @contextmanager
-def notice_of_compilation(what: str) -> Iterator[None]:
+def notice_of_compilation(what: str) -> Generator[None]:
     """Says so if what happens here takes a while."""
     said = f"turgor: compiling the engine for this {what}, once ..."
     notice = threading.Timer(1.5, print, [said], {"file": sys.stderr, "flush": True})

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import re
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -51,11 +53,13 @@ class Device:
         )
         self.name = _ask(driver.cuDeviceGetName(128, self._device)).split(b"\0")[0].decode()
         self._context = _ask(driver.cuDevicePrimaryCtxRetain(self._device))
+        self.busy = 0.0  # [s], in launches so far
 
     def load(self, code: bytes) -> None:
         """Has the one kernel of this machine code ready."""
         self._enter()
-        self._module = _ask(driver.cuModuleLoadData(code))
+        image = np.frombuffer(code, np.uint8)
+        self._module = _ask(driver.cuModuleLoadData(image.ctypes.data))
         self._kernel = _ask(driver.cuModuleGetFunction(self._module, entry_of(code)))
 
     def free_bytes(self) -> int:
@@ -89,8 +93,10 @@ class Device:
         """Runs the kernel in `grid` blocks of `block` threads, to the end."""
         self._enter()
         values, kinds = tuple(value for _, value in arguments), tuple(kind for kind, _ in arguments)
+        began = time.perf_counter()
         _ask(driver.cuLaunchKernel(self._kernel, grid, 1, 1, block, 1, 1, 0, 0, (values, kinds), 0))
         _ask(driver.cuCtxSynchronize())
+        self.busy += time.perf_counter() - began
 
     def _room(self, shape: Sequence[int], itemsize: int) -> Memory:
         self._enter()
@@ -99,8 +105,9 @@ class Device:
         return Memory(address, shape, itemsize, self._free)
 
     def _free(self, address: int) -> None:
-        self._enter()
-        _ask(driver.cuMemFree(address))
+        with suppress(InvalidInput):  # the process ends
+            self._enter()
+            _ask(driver.cuMemFree(address))
 
     def _enter(self) -> None:
         """Makes this the device of the calling thread."""

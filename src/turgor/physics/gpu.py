@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib.metadata import version
@@ -25,11 +25,13 @@ from cuda.core import Linker, LinkerOptions, ObjectCode
 from numba import cuda, typeof, types
 from numba.cuda import compiler, dispatcher
 from numba.cuda.cudadrv import nvvm
+from numba.cuda.cudadrv.error import NvvmSupportError
 
+from turgor.errors import InvalidInput
 from turgor.physics.batch import Batch, World, build_of_sources, notice_of_compilation
 from turgor.physics.driver import Argument, Device, Memory, flat
 from turgor.physics.memory import BYTES, Width, fields
-from turgor.physics.model import VIEWS, Brain, Settings, State
+from turgor.physics.model import VIEWS, Settings, State
 from turgor.physics.step import run_agent, run_blocks
 from turgor.task import Task
 
@@ -39,6 +41,7 @@ THREADS = 128  # of a block of the grid
 BLOCKS = 4
 # every operation rounded as IEEE 754 has it, one by one
 OPTIONS = {"opt": 3, "fma": 0, "ftz": 0, "prec-div": 1, "prec-sqrt": 1}
+_C_TYPES = {"i": ctypes.c_int32, "f": ctypes.c_float}  # of a setting
 SHARE = 0.8  # of the free memory that a batch may take
 
 
@@ -94,7 +97,7 @@ def assemble(ptx: str, compute_capability: tuple[int, int]) -> bytes:
 
 
 @contextmanager
-def _as_if_on(compute_capability: tuple[int, int]) -> Iterator[None]:
+def _as_if_on(compute_capability: tuple[int, int]) -> Generator[None]:
     """numba-cuda asks the present device for its capability when one function calls another, though it is told; here
     it asks us."""
     present = dispatcher.get_current_device
@@ -110,13 +113,18 @@ def machine_code_for(compute_capability: tuple[int, int]) -> bytes:
     """The engine for GPUs of a `compute_capability`, compiled or from the cache, beside the CPU's kernel."""
     start = "engine-sm_{}{}".format(*compute_capability)
     name = f"{start}-{build_of_sources()}-{version('numba-cuda')}.cubin"
-    folder = run_blocks.stats.cache_path and Path(run_blocks.stats.cache_path)
-    if folder and (folder / name).exists():
-        return (folder / name).read_bytes()
-    with notice_of_compilation("GPU"):
-        code = assemble(compile_for(compute_capability), compute_capability)
-    if folder:
-        _keep(code, folder / name, folder.glob(f"{start}-*.cubin"))
+    cache = run_blocks.stats.cache_path
+    file = Path(cache) / name if cache else None
+    if file is not None and file.exists():
+        return file.read_bytes()
+    try:
+        with notice_of_compilation("GPU"):
+            code = assemble(compile_for(compute_capability), compute_capability)
+    except (RuntimeError, OSError, NvvmSupportError, pathfinder.BitcodeLibNotFoundError) as error:
+        expected = "device: expected NVVM and nvJitLink, which compile for the GPU; pip install 'turgor[cuda]'"
+        raise InvalidInput(expected, str(error)) from None
+    if file is not None:
+        _keep(code, file, file.parent.glob(f"{start}-*.cubin"))
     return code
 
 
@@ -134,11 +142,11 @@ class Gpu:
     """A device that runs batches of agents."""
 
     def __init__(self, device: Device) -> None:
-        self._device = device
+        self.device = device
         device.load(machine_code_for(device.compute_capability))
 
     def __repr__(self) -> str:
-        return f"Gpu({self._device.name})"
+        return f"Gpu({self.device.name})"
 
     def world(self, task: Task) -> World:
         """The task as this device sees it."""
@@ -146,13 +154,13 @@ class Gpu:
 
     def batch(self, world: World, starts: np.ndarray) -> DeviceBatch:
         """Agents that are to begin at `starts` [agent, mass, 2]."""
-        return DeviceBatch(world, starts, self._device)
+        return DeviceBatch(world, starts, self.device)
 
     def agents_at_once(self, world: World) -> int:
         """How many agents there is memory for."""
         kernel, masses = world.kernel, world.task.body.mass_count
         each = kernel.block_bytes / ABREAST + 4 * masses * BYTES
-        return max(ABREAST, int(SHARE * self._device.free_bytes() / each) // ABREAST * ABREAST)
+        return max(ABREAST, int(SHARE * self.device.free_bytes() / each) // ABREAST * ABREAST)
 
 
 @lru_cache
@@ -170,7 +178,7 @@ class DeviceBatch(Batch):
         self._fixed = [device.upload(array) for array in (self.kernel.tables, self._grounds)]
         self._results = device.zeros(self.results.shape)
         self._places = [device.upload(array) for array in (self.position, self.velocity)]
-        self._brains = device.zeros((self.blocks, self.kernel.size(Brain)))
+        self._brains = device.zeros((self.blocks, 0))
 
     def _make_memory(self) -> None:
         self.memory = np.zeros((0, self.kernel.size(State)), np.float32)  # none on this side
@@ -205,13 +213,12 @@ class DeviceBatch(Batch):
             for offsets, view in zip(self.kernel.layouts, VIEWS, strict=True)
             for offset in offsets[: len(fields(view))]
         ]
-        kinds = {np.int32: ctypes.c_int32, np.float32: ctypes.c_float}
         arrays = [tables, grounds, self._memory, self._brains, scripts, rooms["traces"], self._results]
         seen = [fresh, position, velocity, commands, rooms["observations"], rooms["stands"]]
         return [
             (ctypes.c_int32, self.agents),
             (ctypes.c_void_p, 0),  # the width, which is all in its type
-            *((kinds[type(value)], value.item()) for value in self.kernel.settings),
+            *((_C_TYPES[value.dtype.char], value.item()) for value in self.kernel.settings),
             *(argument for array in arrays for argument in flat(array)),
             *((ctypes.c_int32, offset) for offset in layouts),
             *(argument for array in seen for argument in flat(array)),
