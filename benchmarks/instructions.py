@@ -21,30 +21,28 @@ from pathlib import Path
 
 FILE = Path(__file__).with_name("instructions.csv")
 GROWTH = 0.05  # [1], that is let pass
-AGENTS, STEPS = 32, 120
+AGENTS, STEPS = 32, 600
 CASES = {
     "small, random": ("small", "random"),
     "large, random": ("large", "random"),
     "large, inflated": ("large", "inflated"),
 }
-TARGET = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma,+sse,+sse2,+sse3,+sse4.1,+sse4.2,+ssse3"}
+FEATURES = "+avx,+avx2,+fma,+sse,+sse2,+sse3,+sse4.1,+sse4.2,+ssse3"
+TARGET = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": FEATURES}
 
 # Run under valgrind, which starts to count when it is told to from inside.
 CHILD = """
 import os, subprocess, sys
-import numpy as np
+from turgor.bench.parts import controllers, make_task
 from turgor.simulate import Simulator
-from turgor.task import make_task
 
 def count(on):
-    subprocess.run(["callgrind_control", "-i", "on" if on else "off", str(os.getpid())], check=True, capture_output=True)
+    command = ["callgrind_control", "-i", "on" if on else "off", str(os.getpid())]
+    subprocess.run(command, check=True, capture_output=True)
 
 body, kind, agents, steps = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-task = make_task("hilly", body=body, steps=steps)
-theta = np.random.default_rng(0).uniform(-1, 1, (agents, task.parameter_count))
-if kind == "inflated":  # springs at rest, as much pressure as there is
-    theta[:] = 0
-    theta[:, -1] = 1000
+task = make_task("hilly", body, steps, kind)
+theta = controllers(kind, task, agents, 0)
 simulator = Simulator(task, threads=1)
 simulator.rollout(theta)
 count(True)
