@@ -1,9 +1,10 @@
 """How fast the engine runs on this machine's GPU: `python benchmarks/gpu.py`, about five minutes.
 
 Needs an NVIDIA GPU and the extra `cuda`. First some agents of each kind run on the CPU as well, and their bits are
-compared. Then whole rollouts of 1800 steps on hilly ground for growing batches, the fastest of several: "kernel" counts the
-time in the GPU's code, "call" also what goes there and back. Controllers: "random" has theta uniform in [-1, 1],
-"inflated" the same with pressure moving by 1 Pa per unit of output, so that bodies keep their gas. theta is float32.
+compared. Then whole rollouts of 1800 steps on hilly ground for growing batches, the fastest of several: "kernel"
+counts the time in the GPU's code, "call" also what goes there and back. Controllers: "random" has theta uniform in
+[-1, 1], "inflated" the same with pressure moving by 1 Pa per unit of output, so that bodies keep their gas. theta is
+float32.
 """
 
 import argparse
