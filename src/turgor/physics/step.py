@@ -180,7 +180,8 @@ def hand_out(settings, model, state, work, result, observations, stands, first):
         stands[agent, 5 * n + 2 * settings.chambers] = result.solved[0, lane]
 
 
-@stage
+# inlined by Numba, not by LLVM: as a stage it would be compiled by itself as well, for a quarter more of the time
+@njit(inline="always")
 def run_block(
     settings, model, ground, state, work, brain, result, script, trace, recording, fresh, position, velocity, commands,
     observations, stands, drive, first, first_step, steps, last_step,
