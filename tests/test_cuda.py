@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import re
+import subprocess
+import sys
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -360,9 +362,21 @@ def test_machine_code_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     gpu.machine_code_for.cache_clear()
 
 
-def test_other_devices_are_refused() -> None:
-    with pytest.raises(InvalidInput, match="device: expected one of cpu, cuda; got 'tpu'"):
-        Simulator(task_of("hilly"), device="tpu")
+@pytest.mark.parametrize("device", ["tpu", None, 0, ["cuda"]])
+def test_other_devices_are_refused(device: Any) -> None:
+    with pytest.raises(InvalidInput, match=re.escape(f"device: expected one of cpu, cuda; got {device!r}")):
+        Simulator(task_of("hilly"), device=device)
+
+
+def test_nothing_of_cuda_is_loaded_before_it_is_asked_for() -> None:
+    code = """
+import sys, numpy, turgor
+task = turgor.make_task("hilly", steps=2)
+turgor.Simulator(task).rollout(numpy.zeros((1, task.parameter_count)))
+print(*(name for name in sys.modules if name.startswith(("cuda.", "turgor.physics.gpu", "turgor.physics.driver"))))
+"""
+    made = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert made.stdout.split() == []
 
 
 def has_gpu() -> bool:

@@ -66,7 +66,7 @@ class Simulator:
             raise InvalidInput(f"threads: expected a whole number, 1 to {MOST_THREADS}", describe(threads))
         self.task = task
         self.threads = threads or available_cores()
-        if device not in DEVICES:
+        if not isinstance(device, str) or device not in DEVICES:
             raise one_of("device", DEVICES, device)
         self.device = device
         self._gpu = open_gpu() if device == "cuda" else None
