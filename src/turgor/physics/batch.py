@@ -5,13 +5,12 @@ from __future__ import annotations
 import operator
 import sys
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from turgor.control import pack
-from turgor.physics.engine import LASTING, PASSING, is_ready, load, run_blocks, words_of
+from turgor.physics.engine import LASTING, PASSING, load, run_blocks, words_of
 from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, room_for
 from turgor.physics.memory import BYTES, LINE, MOST_TRACE_BYTES, aligned, check_memory, fields
 from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
@@ -219,9 +218,7 @@ class Batch:
         self._told = [None], []
 
 
-@lru_cache
 def load_kernel() -> None:
     """Has the kernel ready, from its file or compiled; says so if that takes a while."""
-    if not is_ready():
-        print("turgor: compiling the engine for this processor, once ...", file=sys.stderr, flush=True)
-    load()
+    words = "turgor: compiling the engine for this processor, once ..."
+    load(before_making=lambda: print(words, file=sys.stderr, flush=True))

@@ -9,16 +9,17 @@ written here stands on Numba's custom pipelines; of Numba's steps those are left
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import llvmlite.binding as llvm
 from llvmlite import ir
-from numba import _dynfunc, njit, types
+from numba import njit, types
 from numba.core import compiler, typed_passes, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.cpu import _dynfunc
 from numba.np.arrayobj import populate_array
 from numba.np.numpy_support import from_dtype
 
@@ -28,11 +29,11 @@ from turgor.physics.engine import ENTRY, target_machine
 class Part(JITCodeLibrary):
     """A translated function that waits for the whole."""
 
-    def add_llvm_module(self, module: Any) -> None:
-        for function in module.functions:
+    def add_llvm_module(self, ll_module: Any) -> None:
+        for function in ll_module.functions:
             if not function.is_declaration:
-                function.linkage = "weak_odr"
-        self._final_module.link_in(module)
+                function.linkage = "weak_odr"  # kept though nobody calls it yet; any number of equal copies are one
+        self._final_module.link_in(ll_module)
 
     def finalize(self) -> None:
         self._finalized = True
@@ -85,9 +86,30 @@ class TranslatePart(typed_passes.NativeLowering):
         return True
 
 
+class Remembered:
+    """Numba's typing context, which is asked once what an operator gives for operands of some types."""
+
+    _answers: ClassVar[dict[Any, Any]] = {}
+
+    def __init__(self, context: Any) -> None:
+        self._context = context
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._context, name)
+
+    def resolve_function_type(self, function: Any, args: Any, kws: Any) -> Any:
+        if type(function) is not types.Function or kws:
+            return self._context.resolve_function_type(function, args, kws)
+        _, answers = self._answers.setdefault(id(function), (function, {}))
+        if args not in answers:
+            answers[args] = self._context.resolve_function_type(function, args, kws)
+        return answers[args]
+
+
 class StageCompiler(compiler.CompilerBase):
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, typing_context: Any, *args: Any, **kwargs: Any) -> None:
+        super().__init__(typing_context, *args, **kwargs)
+        self.state.typingctx = Remembered(typing_context)
         self.state.flags.no_compile = True
 
     def define_pipelines(self) -> list[PassManager]:
@@ -99,8 +121,6 @@ class StageCompiler(compiler.CompilerBase):
             (untyped_passes.ReconstructSSA, "ssa"),
             (typed_passes.NopythonTypeInference, "nopython frontend"),
             (typed_passes.PreLowerStripPhis, "remove phis nodes"),
-            (typed_passes.IRLegalization, "ensure IR is legal prior to lowering"),
-            (typed_passes.AnnotateTypes, "annotate types"),
             (TranslatePart, "translate to LLVM"),
             (typed_passes.NoPythonBackend, "nopython mode backend"),
         ):
@@ -144,10 +164,10 @@ def optimised(kernel: Any, arguments: Sequence[Any]) -> Any:
             symbol.linkage = "internal"
     machine = target_machine()
     module.data_layout = str(machine.target_data)
-    options = llvm.create_pipeline_tuning_options(speed_level=3)
-    # the lanes are the vectors
-    options.loop_vectorization = options.slp_vectorization = options.loop_interleaving = False
-    options.loop_unrolling = False
+    # the lanes are the vectors, and their operations long enough without unrolling: more does not make it faster
+    options = llvm.create_pipeline_tuning_options(speed_level=1)
+    options.loop_vectorization = options.slp_vectorization = False
+    options.loop_interleaving = options.loop_unrolling = False
     passes = llvm.create_pass_builder(machine, options)
     passes.getModulePassManager().run(module, passes)
     return module
@@ -186,7 +206,7 @@ def _entry(part: Any, wanted: Sequence[types.Type]) -> ir.Module:
 
 
 @contextmanager
-def _no_collection() -> Iterator[None]:
+def _no_collection() -> Generator[None]:
     """Meanwhile Python does not look for what nobody needs: Numba makes millions of objects that it keeps."""
     was = gc.isenabled()
     gc.disable()

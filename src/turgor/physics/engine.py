@@ -13,7 +13,7 @@ import hashlib
 import os
 import struct
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ import llvmlite.binding as llvm
 import numpy as np
 
 ENTRY = "turgor_run_blocks"
+DIGEST = 32  # [byte], the checksum before the machine code
 # The arguments of `step.run_blocks`: arrays in C order, type and dimensions of each. Those of a batch ...
 LASTING = {
     "constants": (np.float32, 1),
@@ -70,26 +71,21 @@ def run_blocks(words: Sequence[int]) -> None:
 _WORDS = struct.Struct(f"{sum(1 + n for _, n in (LASTING | PASSING).values()) + len(COUNTS)}q")
 
 
-def load() -> None:
-    """Has the machine code in memory."""
+def load(before_making: Callable[[], object] = lambda: None) -> None:
+    """Has the machine code in memory; calls `before_making` if it has to be made."""
     with _loading:
         if _loaded:
             return
-        code = next(_found(), None)
+        code = _found()
         if code is None:
+            before_making()
             code = _made()
             _keep(code)
-        machine = target_machine()
-        compiled = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        compiled = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine())
         compiled.add_object_file(llvm.ObjectFileRef.from_data(code))
         compiled.finalize_object()
         function = ctypes.CFUNCTYPE(None, ctypes.c_char_p)(compiled.get_function_address(ENTRY))
         _loaded.extend([function, compiled])
-
-
-def is_ready() -> bool:
-    """Whether the machine code need not be made."""
-    return bool(_loaded) or next(_found(), None) is not None
 
 
 def _made() -> bytes:
@@ -103,23 +99,28 @@ def _made() -> bytes:
 
 
 def processor() -> tuple[str, str]:
-    """This processor's name and features as LLVM knows them, or those in NUMBA_CPU_NAME, NUMBA_CPU_FEATURES."""
+    """This processor's name and features as LLVM knows them, or those in NUMBA_CPU_NAME and NUMBA_CPU_FEATURES."""
     name, features = os.environ.get("NUMBA_CPU_NAME"), os.environ.get("NUMBA_CPU_FEATURES")
-    return name or llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten() if features is None else features
+    if features is None:
+        try:
+            features = llvm.get_host_cpu_features().flatten()
+        except RuntimeError:  # where LLVM cannot tell
+            features = ""
+    return name or llvm.get_host_cpu_name(), features
 
 
 def target_machine() -> Any:
-    """LLVM's description of the processor, for code that is made for it alone."""
-    with contextlib.suppress(RuntimeError):  # what only old versions need
+    """LLVM's description of the processor, for code that runs here alone."""
+    with contextlib.suppress(RuntimeError):  # raised by versions that need it no more
         llvm.initialize()
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = processor()
-    triple = llvm.get_process_triple()
-    return llvm.Target.from_triple(triple).create_target_machine(
-        cpu=name, features=features, opt=3, reloc="static" if triple.startswith("x86") else "default",
-        codemodel="jitdefault", jit=True,
-    )  # fmt: skip
+    target = llvm.Target.from_triple(llvm.get_process_triple())
+    place = "static" if target.name.startswith("x86") else "default"  # as Numba has it
+    return target.create_target_machine(
+        cpu=name, features=features, opt=3, reloc=place, codemodel="jitdefault", jit=True
+    )
 
 
 # --- the file -----------------------------------------------------------------------------------------------------
@@ -130,7 +131,7 @@ def _folders() -> list[Path]:
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
         return [Path(given)]
-    user = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+    user = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or os.path.expanduser("~/.cache")
     return [_sources / "__pycache__", Path(user) / "turgor"]
 
 
@@ -142,25 +143,26 @@ def _name() -> str:
     return f"kernel-{hashlib.sha256(where.encode()).hexdigest()[:12]}-{hashlib.sha256(what).hexdigest()[:12]}"
 
 
-def _found() -> Iterator[bytes]:
-    """The contents of files that are there and whole."""
+def _found() -> bytes | None:
+    """What the file holds, if there is one that is whole."""
     for folder in _folders():
         with contextlib.suppress(OSError):
             data = (folder / _name()).read_bytes()
-            digest, code = data[:32], data[32:]
+            digest, code = data[:DIGEST], data[DIGEST:]
             if hashlib.sha256(code).digest() == digest:
-                yield code
+                return code
+    return None
 
 
 def _keep(code: bytes) -> None:
-    """Writes the file, and removes those of older sources."""
+    """Writes the file into the first folder that takes it, and removes those of older sources there."""
     from turgor.files import NotWritten, write_whole
 
     for folder in _folders():
         with contextlib.suppress(OSError, NotWritten):
             folder.mkdir(parents=True, exist_ok=True)
             write_whole(folder / _name(), hashlib.sha256(code).digest() + code)
-            for old in folder.glob(_name().rpartition("-")[0] + "-*"):
-                if old.name != _name():
-                    old.unlink(missing_ok=True)
+            for file in folder.glob(f"{_name().rpartition('-')[0]}-*"):
+                if file.name != _name():
+                    file.unlink(missing_ok=True)
             return
