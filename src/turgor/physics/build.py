@@ -1,16 +1,15 @@
 """From stages in Python to machine code: Numba types and translates every function, LLVM optimises all of them at once.
 
 By itself Numba optimises each function alone, makes machine code of it, and does both again in whatever calls it. A
-stage is only ever a part of the kernel, so that its translation is kept as it is until the kernel is whole. What is
-written here stands on Numba's custom pipelines; of Numba's steps those are left out that stages have no use for
-(closures, literals, array expressions, rewrites).
+stage is only ever a part of the kernel, so that its translation is kept as it is until the kernel is whole. This file
+stands on Numba's custom pipelines, and leaves those of Numba's steps out that stages have no use for (closures,
+literals, array expressions, rewrites).
 """
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+import itertools
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import llvmlite.binding as llvm
@@ -154,22 +153,25 @@ def machine_code(kernel: Any, arguments: Sequence[Any]) -> bytes:
 def optimised(kernel: Any, arguments: Sequence[Any]) -> Any:
     """The kernel as one LLVM module, ready to be made machine code of."""
     wanted = tuple(types.Array(from_dtype(a[0]), a[1], "C") if isinstance(a, tuple) else a for a in arguments)
-    with _no_collection():
-        kernel.compile(wanted)
-        part = kernel.overloads[wanted]
-        module = part.library._get_module_for_linking().clone()
-        module.link_in(llvm.parse_assembly(str(_entry(part, wanted))))
+    kernel.compile(wanted)
+    part = kernel.overloads[wanted]
+    module = part.library._get_module_for_linking().clone()
+    module.link_in(llvm.parse_assembly(str(_entry(part, wanted))))
+    module.verify()
     for symbol in (*module.functions, *module.global_variables):
         if not symbol.is_declaration and symbol.name != ENTRY:
             symbol.linkage = "internal"
     machine = target_machine()
     module.data_layout = str(machine.target_data)
-    # the lanes are the vectors, and their operations long enough without unrolling: more does not make it faster
-    options = llvm.create_pipeline_tuning_options(speed_level=1)
+    # the lanes are the vectors, and their operations long enough without unrolling; level 3 is no faster
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
     options.loop_vectorization = options.slp_vectorization = False
     options.loop_interleaving = options.loop_unrolling = False
     passes = llvm.create_pass_builder(machine, options)
     passes.getModulePassManager().run(module, passes)
+    for number, function in enumerate(module.functions):  # Numba counts in its names what a process has compiled
+        if function.linkage == llvm.Linkage.internal:
+            function.name = f"part{number}"
     return module
 
 
@@ -180,7 +182,7 @@ def _entry(part: Any, wanted: Sequence[types.Type]) -> ir.Module:
     word = ir.IntType(64)
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [word.as_pointer()]), ENTRY)
     builder = ir.IRBuilder(function.append_basic_block())
-    at = iter(range(1000))
+    at = itertools.count()
 
     def take() -> ir.Value:
         return builder.load(builder.gep(function.args[0], [word(next(at))]))
@@ -203,15 +205,3 @@ def _entry(part: Any, wanted: Sequence[types.Type]) -> ir.Module:
     context.call_conv.call_function(builder, callee, description.restype, description.argtypes, values)
     builder.ret_void()
     return module
-
-
-@contextmanager
-def _no_collection() -> Generator[None]:
-    """Meanwhile Python does not look for what nobody needs: Numba makes millions of objects that it keeps."""
-    was = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was:
-            gc.enable()

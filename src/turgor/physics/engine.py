@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import hashlib
 import os
 import struct
@@ -89,10 +90,16 @@ def load(before_making: Callable[[], object] = lambda: None) -> None:
 
 
 def _made() -> bytes:
-    from turgor.physics.build import machine_code
-    from turgor.physics.step import ARGUMENTS, run_blocks
+    collecting = gc.isenabled()
+    gc.disable()  # Numba makes millions of objects that it keeps
+    try:
+        from turgor.physics.build import machine_code
+        from turgor.physics.step import ARGUMENTS, run_blocks
 
-    return machine_code(run_blocks, ARGUMENTS)
+        return machine_code(run_blocks, ARGUMENTS)
+    finally:
+        if collecting:
+            gc.enable()
 
 
 # --- the processor ------------------------------------------------------------------------------------------------
