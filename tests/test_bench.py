@@ -137,6 +137,38 @@ def test_command_writes_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.usefixtures("tiny")
+@pytest.mark.parametrize("kind", ["csv", "json"])
+def test_command_compares_with_an_earlier_run(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, only = tmp_path / f"rows.{kind}", ["--quick", "--only", "kernel"]
+    assert bench.main([*only, f"--{kind}", str(file)]) == 0
+    if kind == "json":
+        changed = json.loads(file.read_text(encoding="utf-8"))
+        changed["machine"], changed["rows"] = "another", changed["rows"][1:]
+        file.write_text(json.dumps(changed), encoding="utf-8")
+    capsys.readouterr()
+    assert bench.main([*only, "--compare", str(file)]) == 0
+    out = capsys.readouterr().out
+    assert "now / before" in out
+    assert ("ANOTHER MACHINE" in out) == ("without a figure before: 1" in out) == (kind == "json")
+    compared = out[out.index("now / before") :].splitlines()[1:]
+    rows = out[: out.index("\nagainst ")].splitlines()[2:]
+    assert len(compared) == len(rows) - (kind == "json")
+    for line in compared:
+        before, now, ratio = map(float, line.split()[-3:])
+        assert ratio == pytest.approx(now / before, rel=0.002, abs=0.001)  # as far as figures are printed
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"rows": [{}]}', "name,value\nx,y\n", "name\nx\n"])
+def test_comparing_with_something_else_is_told(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rows").write_text(text, encoding="utf-8")
+    assert bench.main(["--compare", str(tmp_path / "rows")]) == 2
+    assert bench.main(["--compare", str(tmp_path / "nowhere")]) == 2
+    told = capsys.readouterr().err
+    assert "expected what --csv or --json wrote" in told
+    assert "expected a file of an earlier run" in told
+
+
+@pytest.mark.usefixtures("tiny")
 def test_a_part_that_cannot_be_measured_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
     turgor bench                                   everything, some minutes
     turgor bench --only kernel peer --csv results.csv
+    turgor bench --compare results.csv             and what changed since then
     turgor bench --quick                           a look, in about a minute
 
 Every row says what was measured. What is to be compared is measured in turn in one run, and the fastest of several
@@ -16,7 +17,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from turgor.bench.parts import PARTS, QUICK, Plan, Skipped
-from turgor.bench.report import Row, as_csv, as_json, cells, environment, machine_seconds, own_seconds, say, show
+from turgor.bench.report import (
+    Row,
+    as_csv,
+    as_json,
+    cells,
+    environment,
+    machine_seconds,
+    own_seconds,
+    read_record,
+    say,
+    show,
+    show_comparison,
+)
 from turgor.errors import InvalidInput, describe
 
 
@@ -27,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="fewer rows and shorter: for a look, not for a record")
     parser.add_argument("--csv", metavar="FILE", help="write the rows there; in a folder, to MACHINE.csv")
     parser.add_argument("--json", metavar="FILE", help="the same as JSON; in a folder, to MACHINE.json")
+    parser.add_argument("--compare", type=Path, metavar="FILE", help="show what changed since FILE, of --csv or --json")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,6 +61,7 @@ def run(namespace: argparse.Namespace) -> int:
         raise InvalidInput(f"--only, --skip: expected to leave one of {', '.join(PARTS)}", "none")
     here = environment()
     files = {kind: target(getattr(namespace, kind), kind, here["machine"]) for kind in ("csv", "json")}
+    before = None if namespace.compare is None else read_record(namespace.compare)
     rows: list[Row] = []
     began, busy, own = time.perf_counter(), machine_seconds(), own_seconds()
     status = measure(names, QUICK if namespace.quick else Plan(), rows)
@@ -55,6 +70,8 @@ def run(namespace: argparse.Namespace) -> int:
         here["other_load"] = f"{max(other / (time.perf_counter() - began), 0):.2f}"
     if rows:
         show(rows, here)
+        if before is not None:
+            show_comparison(rows, before, here)
         writers = {"csv": as_csv, "json": as_json}
         for kind, file in files.items():
             if file is not None:

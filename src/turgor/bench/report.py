@@ -11,8 +11,11 @@ import re
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import msgspec
+
+from turgor.errors import InvalidInput, describe
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
@@ -27,6 +30,13 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     value: float
     unit: str
     what: str
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """What an earlier run wrote."""
+
+    facts: dict[str, str]  # of `environment`
+    rows: list[Row]
 
 
 def say(line: str) -> None:
@@ -82,8 +92,32 @@ def show(rows: Sequence[Row], here: dict[str, str]) -> None:
     title = f"{here['cpu']}; turgor {here['turgor']}, Python {here['python']}, Numba {here['numba']}; {here['date']}"
     if here["other_load"]:
         title += f"; other programs kept {here['other_load']} of {os.cpu_count()} cores busy"
-    names = Row.__struct_fields__
-    lines = [cells(row) for row in rows]
+    show_table(title, Row.__struct_fields__, [cells(row) for row in rows])
+
+
+def show_comparison(rows: Sequence[Row], before: Record, here: dict[str, str]) -> None:
+    """Prints every row that `before` has as well, with both figures and the new one against the old."""
+    old = {identity(row): row for row in before.rows}
+    pairs = [(old[identity(row)], row) for row in rows if identity(row) in old]
+    title = f"against {before.facts.get('date', '?')}, turgor {before.facts.get('turgor', '?')}"
+    if before.facts.get("machine") != here["machine"]:
+        title += f"; ANOTHER MACHINE: {before.facts.get('cpu') or before.facts.get('machine', '?')}"
+    names = ("name", "body", "task", "controllers", "batch", "threads", "unit", "before", "now", "now / before")
+    lines = [
+        ["" if cell is None else str(cell) for cell in (*identity(now), now.unit)]
+        + [f"{was.value:.4g}", f"{now.value:.4g}", f"{now.value / was.value:.3f}" if was.value else ""]
+        for was, now in pairs
+    ]
+    left = len(rows) - len(pairs)
+    show_table(title + (f"; without a figure before: {left}" if left else ""), names, lines)
+
+
+def identity(row: Row) -> tuple[str | int | None, ...]:
+    """What a row is a figure of."""
+    return row.name, row.body, row.task, row.controllers, row.batch, row.threads
+
+
+def show_table(title: str, names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
     if sys.stdout.isatty():
         from rich import box
         from rich.console import Console
@@ -91,7 +125,7 @@ def show(rows: Sequence[Row], here: dict[str, str]) -> None:
 
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
         for name in names:
-            right = name in ("batch", "threads", "value")
+            right = name in ("batch", "threads", "value", "before", "now", "now / before")
             table.add_column(name, justify="right" if right else "left", no_wrap=name != "what")
         for line in lines:
             table.add_row(*line)
@@ -116,3 +150,21 @@ def as_csv(rows: Sequence[Row], here: dict[str, str]) -> str:
 def as_json(rows: Sequence[Row], here: dict[str, str]) -> str:
     """The same as JSON: what all rows share, and the rows."""
     return json.dumps({**here, "rows": [msgspec.structs.asdict(row) for row in rows]}, indent=1) + "\n"
+
+
+def read_record(path: Path) -> Record:
+    """What `as_csv` or `as_json` wrote. Raises `InvalidInput`."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        if text.lstrip().startswith("{"):
+            facts = json.loads(text)
+            rows = facts.pop("rows")
+        else:
+            rows = list(csv.DictReader(io.StringIO(text)))
+            facts = {name: value for name, value in rows[0].items() if name not in Row.__struct_fields__}
+            rows = [{name: line[name] for name in Row.__struct_fields__ if line[name] != ""} for line in rows]
+        return Record(facts=facts, rows=msgspec.convert(rows, list[Row], strict=False))
+    except OSError as error:
+        raise InvalidInput(f"{path}: expected a file of an earlier run", error.strerror) from None
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise InvalidInput(f"{path}: expected what --csv or --json wrote", describe(error)) from None

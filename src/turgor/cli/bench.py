@@ -21,7 +21,7 @@ def _bench(options: argparse.Namespace) -> int:
 
 BENCH = Command(
     "Measure how fast the engine is on this machine.",
-    "examples:\n  turgor bench --quick\n  turgor bench --csv results.csv",
+    "examples:\n  turgor bench --quick\n  turgor bench --csv results.csv\n  turgor bench --compare results.csv",
     _bench_options,
     _bench,
 )

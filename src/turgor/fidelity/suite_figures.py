@@ -20,7 +20,7 @@ SMALLEST = 1e-8  # [m], of what is drawn on a logarithmic axis
 def draw_growth(rows: Sequence[Growth], path: Path) -> None:
     """How far each engine is from the golden data, over the steps: a panel a scene, a line a case."""
     with paper_style():
-        figure = make_sheet(2.5)
+        figure = make_sheet(2.7)
         panels = figure.subplots(1, len(SCENES), sharey=True)
         for axes, (scene, title) in zip(panels, SCENES.items(), strict=True):
             mine = [row for row in rows if row.case.split("__")[1] == scene]
@@ -52,7 +52,7 @@ def _draw_floor(rows: Sequence[Growth], axes: Any) -> None:
 def draw_ranks(rows: Sequence[Ranked], path: Path) -> None:
     """Rank correlation of random controllers with Box2D 2.3: a row a cell, a mark an engine."""
     with paper_style():
-        figure = make_sheet(2.6)
+        figure = make_sheet(2.8)
         panels = figure.subplots(1, 2, sharey=True, sharex=True)
         for axes, task in zip(panels, ("hilly", "escape"), strict=True):
             mine = [row for row in rows if row.task == task]
@@ -61,11 +61,11 @@ def draw_ranks(rows: Sequence[Ranked], path: Path) -> None:
                 for row in mine:
                     if (row.body, row.condition) != cell or row.rank is None or row.against != BOX2D:
                         continue
-                    look = LOOKS[row.engine.removesuffix(AGAIN)]
-                    size = 8 if row.engine == BOX2D + AGAIN else 5
-                    axes.plot(
-                        row.rank, y, look.marker, color=look.colour, markersize=size, markeredgewidth=1.4, clip_on=False
-                    )
+                    if row.engine == BOX2D + AGAIN:
+                        axes.plot(row.rank, y, "|", color=INK, markersize=13, markeredgewidth=1.6, clip_on=False)
+                        continue
+                    look, top = LOOKS[row.engine], 3 if row.engine == HERE else 2
+                    axes.plot(row.rank, y, look.marker, color=look.colour, markersize=5, zorder=top, clip_on=False)
             axes.set_yticks(range(len(cells)), [f"{body}, {condition}" for body, condition in reversed(cells)])
             axes.set_xlim(0, 1)
             axes.set_title(f"{task}: rank correlation with Box2D 2.3", loc="left")
@@ -109,8 +109,10 @@ def _legend(figure: Any, engines: Sequence[str], *, floor: bool, box2d: str = ""
     if floor:
         handles.append(Line2D([], [], color=GREY, label="Box2D 2.3, start moved by 1e-6 m"))
     if box2d:
-        handles.append(Line2D([], [], color=INK, linestyle="", marker="P", markersize=9, label=box2d))
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        handles.append(
+            Line2D([], [], color=INK, linestyle="", marker="|", markersize=11, markeredgewidth=1.6, label=box2d)
+        )
+    figure.legend(handles=handles, loc="outside lower center", ncols=3 if len(handles) > 4 else len(handles))
 
 
 def _save(figure: Any, path: Path) -> None:
