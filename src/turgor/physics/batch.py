@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
+import operator
 import sys
-import threading
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from turgor.body import Body
 from turgor.control import pack
+from turgor.physics.engine import LASTING, PASSING, load, run_blocks, words_of
 from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, room_for
-from turgor.physics.memory import BYTES, LINE, MOST_TRACE_BYTES, Width, aligned, check_memory, fields
+from turgor.physics.memory import BYTES, LINE, MOST_TRACE_BYTES, aligned, check_memory, fields
 from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
-from turgor.physics.step import run_blocks
 from turgor.physics.tables import ground_tables, make_kernel, write_ground
 from turgor.scene import Scene
 from turgor.task import Task
@@ -66,6 +62,7 @@ class Batch:
         self.memory = aligned(self.blocks, self.kernel.size(State))
         self.brains = aligned(self.blocks, self.kernel.size(Brain))
         self.results = aligned(self.blocks, self.kernel.size(Result))
+        self._told: tuple[Sequence[Any], list[int]] = [None], []  # the last arrays, and where they are
 
     @property
     def blocks(self) -> int:
@@ -115,15 +112,24 @@ class Batch:
         if script is not None:
             scripts = aligned(1, script.size * WIDTH)
             scripts[0] = np.repeat(script.ravel(), WIDTH)
-        traces = _NO_TRACE if trace is None else trace.reshape(1, -1)
-        assert traces.ctypes.data % LINE == 0 or not traces.size  # the kernel moves whole cache lines
-        kernel = self.kernel
-        run_blocks(
-            _width(), kernel.settings, kernel.tables, self._grounds, self.memory, self.brains, scripts, traces,
-            self.results, kernel.layouts, fresh, self.position, self.velocity, commands, observations, stands,
-            drive, self.steps, steps, last,
-        )  # fmt: skip
+        traces = _NO_TRACE
+        if trace is not None:
+            assert trace.ctypes.data % LINE == 0  # the kernel moves whole cache lines
+            traces = trace.reshape(1, -1)
+        words = words_of((scripts, traces, fresh, commands, observations, stands), PASSING)
+        run_blocks([*self._lasting(), *words, drive, self.steps, steps, last])
         self.steps += steps
+
+    def _lasting(self) -> list[int]:
+        """The words of the arrays that stay from call to call."""
+        kernel = self.kernel
+        arrays = (
+            kernel.constants, kernel.layouts, kernel.tables, self._grounds, self.memory, self.brains, self.results,
+            self.position, self.velocity,
+        )  # fmt: skip
+        if not all(map(operator.is_, arrays, self._told[0])):
+            self._told = arrays, words_of(arrays, LASTING)
+        return self._told[1]
 
     def begin(self, drive: int = CONTROLLER, **outputs: Any) -> None:
         """Puts all agents at the start."""
@@ -209,25 +215,10 @@ class Batch:
             buffer = state[name]
             vars(self)[name] = aligned(*buffer.shape)
             vars(self)[name][:] = buffer
+        self._told = [None], []
 
 
-@lru_cache
-def _width() -> Width:
-    """The kernel's width, marked with its sources."""
-    sources = sorted(Path(__file__).parent.glob("*.py"))
-    return Width(WIDTH, hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:12])
-
-
-@lru_cache
 def load_kernel() -> None:
-    """Has the kernel ready, compiled or from the cache; says so if that takes a while."""
-    said = "turgor: compiling the engine for this processor, once ..."
-    notice = threading.Timer(1.5, print, [said], {"file": sys.stderr, "flush": True})
-    notice.daemon = True
-    notice.start()
-    body = Body([[0.0, 0.0]])
-    task = Task(name="nothing", body=body, scene=Scene([]), position=body.position, condition="passive")
-    try:
-        Batch(World(task), np.zeros((0, 1, 2))).run(CONTROLLER, 0, 0)
-    finally:
-        notice.cancel()
+    """Has the kernel ready, from its file or compiled; says so if that takes a while."""
+    words = "turgor: compiling the engine for this processor, once ..."
+    load(before_making=lambda: print(words, file=sys.stderr, flush=True))

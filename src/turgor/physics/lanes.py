@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils, extending
 from numba.core.extending import (
     lower_builtin,
@@ -36,19 +36,6 @@ def intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
     """Numba's `intrinsic`, typed as it is called: without the typing context."""
     return extending.intrinsic(function)
 
-
-# One of these above every function of the kernel. No fast-math: see above.
-_options: dict[str, Any] = {
-    "error_model": "numpy",
-    "boundscheck": False,
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-}
-stage = njit(forceinline=True, **_options)
-rare = njit(**_options)
-inlined = stage
-# Compiled once however many places call it: without the word, a function called from a stage is inlined like it.
-shared = njit(forceinline=False, **_options)
 
 # --- values -------------------------------------------------------------------------------------------------------
 

@@ -1,25 +1,26 @@
 """The whole step, and the kernel that runs it for blocks of agents."""
 
-from functools import partial
-
 import numpy as np
-from numba import njit
+from numba import types
 
 from turgor.physics.actuate import actuate, agent_of, take_commands, take_lengths
+from turgor.physics.build import rare, stage
 from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, first_column, note_travel
 from turgor.physics.control import control
-from turgor.physics.lanes import any_lane, rare, select, stage
+from turgor.physics.engine import COUNTS, LASTING, PASSING
+from turgor.physics.lanes import any_lane, select
 from turgor.physics.manifold import NO_ID
-from turgor.physics.memory import lane_count, views
 from turgor.physics.model import (
     COMMANDS,
     CONTROLLER,
     UNKNOWN,
+    WIDTH,
     Brain,
     Ground,
     Model,
     Result,
     Script,
+    Settings,
     State,
     Trace,
     Work,
@@ -28,6 +29,7 @@ from turgor.physics.pressure import apply_forces, gas_law, signed_area
 from turgor.physics.sense import grow_older, sense
 from turgor.physics.solver import correct_positions, integrate, solve_velocities, warm_start_contacts
 from turgor.physics.springs import prepare_springs
+from turgor.physics.views import WidthType, lane_count, numbers, views
 
 
 @stage
@@ -180,8 +182,9 @@ def hand_out(settings, model, state, work, result, observations, stands, first):
         stands[agent, 5 * n + 2 * settings.chambers] = result.solved[0, lane]
 
 
-def _run_blocks(
-    width, settings, tables, grounds, memory, brains, scripts, traces, results, layouts, fresh, position, velocity,
+@rare
+def run_blocks(
+    width, constants, layouts, tables, grounds, memory, brains, results, position, velocity, scripts, traces, fresh,
     commands, observations, stands, drive, first_step, steps, last_step,
 ):  # fmt: skip
     """Runs every block of `memory` [block, size] for `steps` steps from `first_step`, after the agents that are `fresh`
@@ -191,6 +194,7 @@ def _run_blocks(
     `layouts` [view, field]. `commands` [agent, output] are those of the drive COMMANDS. Writes `results`, and `traces`,
     `observations`, `stands` if there is room for them.
     """
+    settings = numbers(Settings, constants)
     model = views(Model, tables, layouts[0], width)
     recording = traces.shape[1] > 0
     for block in range(len(memory)):
@@ -220,10 +224,4 @@ def _run_blocks(
             hand_out(settings, model, state, work, result, observations, stands, first)
 
 
-# The cache knows `width`, and through it the sources of all that is called here: see memory.Width. Where no folder can
-# be written to, there is no cache.
-_compile = partial(njit, nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True)
-try:
-    run_blocks = _compile(cache=True)(_run_blocks)
-except RuntimeError:
-    run_blocks = _compile()(_run_blocks)
+ARGUMENTS = (WidthType(WIDTH), *LASTING.values(), *PASSING.values(), *(types.int64 for _ in COUNTS))

@@ -55,6 +55,7 @@ class Kernel(NamedTuple):
     """A task as the kernel sees it, in Python: settings, tables, and the layout of a block's memory."""
 
     settings: Settings
+    constants: np.ndarray  # the settings as the kernel reads them, float32 and int32 in one array [setting]
     tables: np.ndarray  # float32 [size]
     layouts: np.ndarray  # offsets of the fields of VIEWS and where each ends, [view, field]
     lengths: dict[str, int]
@@ -168,7 +169,7 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
         velocity_scale=np.float32(1 / task.sensing.velocity_scale),
         half_width=np.float32(task.end.half_width if isinstance(task.end, Leave) else math.inf),
     )
-    kernel = Kernel(settings, buffer, layouts, lengths)
+    kernel = Kernel(settings, _constants(settings), buffer, layouts, lengths)
     for name, values in tables.items():
         if (np.isfinite(values) & (np.abs(values) > LARGEST)).any():
             raise InvalidInput(f"{name}: expected numbers within {LARGEST:.0e}", f"{np.abs(values).max():.3g}")
@@ -209,6 +210,11 @@ def _layouts(lengths: dict[str, int]) -> np.ndarray:
     for k, row in enumerate(rows):
         table[k, : len(row)] = row
     return table
+
+
+def _constants(settings: Settings) -> np.ndarray:
+    """The settings, one behind the other."""
+    return np.frombuffer(b"".join(number.tobytes() for number in settings), dtype=np.float32)
 
 
 def _pressure_source(task: Task) -> int:
