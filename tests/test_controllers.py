@@ -27,8 +27,9 @@ from turgor.control import (
 from turgor.errors import InvalidInput
 from turgor.physics import reference, reference_control
 from turgor.physics.control import sine
-from turgor.physics.memory import Floats, Width, aligned, field_of, layout, views
+from turgor.physics.memory import Floats, aligned, field_of, layout
 from turgor.physics.model import WIDTH
+from turgor.physics.views import Width, views
 from turgor.scene import flat
 from turgor.simulate import Simulator
 from turgor.task import Task, make_task, task_from_json, task_to_json

@@ -175,10 +175,12 @@ ELSEWHERE = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import test_determinism
-from turgor.physics.step import run_blocks
+from turgor.physics.build import optimised
+from turgor.physics.engine import target_machine
+from turgor.physics.step import ARGUMENTS, run_blocks
 
 print(test_determinism.digest())
-code = "".join(run_blocks.inspect_asm().values())
+code = target_machine().emit_assembly(optimised(run_blocks, ARGUMENTS))
 print(*(name for name in ("xmm", "ymm", "zmm", "vfmadd") if name in code))
 """
 

@@ -20,8 +20,9 @@ from turgor.control import Distributed, Sinusoid
 from turgor.physics import reference
 from turgor.physics.batch import Batch, World
 from turgor.physics.control import tanh
-from turgor.physics.memory import Floats, Width, aligned, field_of, layout, views
+from turgor.physics.memory import Floats, aligned, field_of, layout
 from turgor.physics.model import COMMANDS, CONTROLLER, WIDTH, Model, State
+from turgor.physics.views import Width, views
 from turgor.scene import GROUND_DEPTH, Scene
 from turgor.simulate import Simulator, replay
 from turgor.task import Physics, Task, make_task

@@ -18,15 +18,12 @@ from turgor.physics.memory import (
     FloatTable,
     Ints,
     IntTable,
-    Width,
     aligned,
     field_of,
     fields,
-    fill,
-    lane_count,
     layout,
-    views,
 )
+from turgor.physics.views import Width, fill, lane_count, numbers, views
 
 WIDTHS = [1, 2, 4, 8, 16, 32]
 F = np.float32
@@ -416,10 +413,27 @@ def lanes_of(width):
     return lane_count(width)
 
 
-def test_width_and_build_are_part_of_the_signature() -> None:
-    known = [Width(4, "a"), Width(8, "a"), Width(8, "b"), Width(8)]
-    assert [int(width) for width in known] == [4, 8, 8, 8]
-    assert len({typeof(width) for width in known}) == 4
-    assert typeof(Width(8, "b")) == typeof(Width(8, "b"))
-    assert [lanes_of(width) for width in [*known, *known]] == [4, 8, 8, 8] * 2
-    assert len(lanes_of.signatures) == 4
+def test_the_width_is_part_of_the_signature() -> None:
+    known = [Width(4), Width(8)]
+    assert [int(width) for width in known] == [4, 8]
+    assert typeof(Width(4)) == typeof(Width(4)) != typeof(Width(8))
+    assert [lanes_of(width) for width in [*known, *known]] == [4, 8] * 2
+    assert len(lanes_of.signatures) == 2
+
+
+class Mixed(NamedTuple):
+    count: np.int32
+    share: np.float32
+    last: np.int32
+
+
+@compiled
+def sum_of_numbers(buffer):
+    n = numbers(Mixed, buffer)
+    return n.count + n.share * n.last
+
+
+def test_single_numbers_of_both_kinds() -> None:
+    given = Mixed(np.int32(-7), np.float32(0.1), np.int32(2**30))
+    buffer = np.frombuffer(b"".join(number.tobytes() for number in given), dtype=F)
+    assert sum_of_numbers(buffer) == -7 + np.float64(F(0.1)) * 2**30

@@ -242,7 +242,7 @@ def startup(plan: Plan) -> Iterator[Row]:
         what = "process start to the result of the first rollout, the engine compiled on the way"
         yield Row(name="startup.cold", **rollout, value=cold, what=what)
         warm = quickest_start(plan, "-c", FIRST_ROLLOUT, NUMBA_CACHE_DIR=cache)
-        what = "process start to the result of the first rollout, the engine from Numba's cache"
+        what = "process start to the result of the first rollout, the engine from its file"
         yield Row(name="startup.warm", **rollout, value=warm, what=what)
         what = "startup.cold less startup.warm: what compiling takes"
         yield Row(name="startup.compile", value=cold - warm, unit="s", what=what)
@@ -255,7 +255,7 @@ def quickest_start(plan: Plan, *arguments: str, **environment: str) -> float:
 
 
 def warm_up() -> None:
-    """Has the engine compiled and in Numba's cache."""
+    """Has the engine compiled and in its file."""
     import numpy as np
 
     from turgor.simulate import Simulator

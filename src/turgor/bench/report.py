@@ -48,13 +48,12 @@ def environment() -> dict[str, str]:
     """What every row depends on: the machine by its processor, the day, the versions, other programs' load (later)."""
     from importlib.metadata import version
 
-    from llvmlite.binding import get_host_cpu_name
-
     from turgor import __version__
+    from turgor.physics.engine import processor
     from turgor.runs import machine
 
     # "AMD EPYC" alone would name ten years of processors: the compiler's name for it tells them apart
-    facts, compiled_for = machine(), os.environ.get("NUMBA_CPU_NAME") or get_host_cpu_name()
+    facts, compiled_for = machine(), processor()[0]
     model = re.sub(r"\((R|TM)\)|\bCPU\b", "", facts["cpu"], flags=re.IGNORECASE)
     return {
         "machine": re.sub(r"[^a-z0-9]+", "-", f"{model} {compiled_for}".lower()).strip("-"),

@@ -1,9 +1,10 @@
 """Actuation: rest lengths and pressures from commands."""
 
-from turgor.physics.lanes import inlined, select, stage
-from turgor.physics.memory import fill
+from turgor.physics.build import inlined, stage
+from turgor.physics.lanes import select
 from turgor.physics.model import CONTROLLED
 from turgor.physics.sense import clamp
+from turgor.physics.views import fill
 
 
 @stage

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
+import operator
 import sys
-import threading
-from collections.abc import Generator, Iterable, Sequence
-from contextlib import contextmanager
-from functools import lru_cache
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from turgor.body import Body
 from turgor.control import pack
+from turgor.physics.engine import LASTING, PASSING, load, run_blocks, words_of
 from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, room_for
-from turgor.physics.memory import BYTES, LINE, MOST_TRACE_BYTES, Width, aligned, check_memory, fields
+from turgor.physics.memory import BYTES, LINE, MOST_TRACE_BYTES, aligned, check_memory, fields
 from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
-from turgor.physics.step import run_blocks
-from turgor.physics.tables import ON_CPU, ground_tables, make_kernel, write_ground
+from turgor.physics.tables import ground_tables, make_kernel, write_ground
 from turgor.scene import Scene
 from turgor.task import Task
 
@@ -33,10 +28,10 @@ _SPARE = 0.15  # room for scenes that are a little larger than those seen
 class World:
     """A task as the kernel sees it, with its one scene: what the batches of a simulator share."""
 
-    def __init__(self, task: Task, width: Width = ON_CPU) -> None:
+    def __init__(self, task: Task) -> None:
         self.task = task
         columns = self.cut(task.scene)
-        self.kernel = make_kernel(task, room_for([columns]), width=width)
+        self.kernel = make_kernel(task, room_for([columns]))
         self.grounds = aligned(1, self.kernel.size(Ground))
         write_ground(ground_tables(self.kernel, self.grounds[0]), columns)
 
@@ -64,16 +59,14 @@ class Batch:
         else:
             self._make_room(room_for(self._scenes, _SPARE))
             self._write_scenes(range(self.agents))
-        self._make_memory()
+        self.memory = aligned(self.blocks, self.kernel.size(State))
         self.brains = aligned(self.blocks, self.kernel.size(Brain))
         self.results = aligned(self.blocks, self.kernel.size(Result))
-
-    def _make_memory(self) -> None:
-        self.memory = aligned(self.blocks, self.kernel.size(State))
+        self._told: tuple[Sequence[Any], list[int]] = [None], []  # the last arrays, and where they are
 
     @property
     def blocks(self) -> int:
-        return -(-self.agents // self.kernel.abreast)
+        return -(-self.agents // WIDTH)
 
     @property
     def own_scenes(self) -> bool:
@@ -81,20 +74,20 @@ class Batch:
 
     def think(self, theta: np.ndarray) -> None:
         """Gives the agents their controllers, `theta` [agent, parameter]."""
-        task, abreast = self._task, self.kernel.abreast
+        task = self._task
         weights, biases = pack(theta, task.body, task.condition, task.controller, task.physics.dt)
-        lanes = np.minimum(np.arange(self.blocks * abreast), self.agents - 1)  # the last agent in lanes left over
-        for brain, agents in zip(self.brains, lanes.reshape(-1, abreast), strict=True):
+        lanes = np.minimum(np.arange(self.blocks * WIDTH), self.agents - 1)  # the last agent in lanes left over
+        for brain, agents in zip(self.brains, lanes.reshape(-1, WIDTH), strict=True):
             self.kernel.field(brain, Brain, "weight")[:] = weights[agents].T
             self.kernel.field(brain, Brain, "bias")[:] = biases[agents].T
 
     def trace(self, steps: int) -> np.ndarray:
         """Room for a recording of the first block, float32 [step + 1, row, lane]. Raises `InvalidInput` for more steps
         than can be recorded."""
-        body, abreast = self.kernel.lengths, self.kernel.abreast
+        body = self.kernel.lengths
         row = 5 * body["mass"] + body["spring"] + body["chamber"] + body["input"]
-        check_memory("steps: expected fewer to be recorded", BYTES * abreast * row * (steps + 1), MOST_TRACE_BYTES)
-        return aligned(steps + 1, row * abreast).reshape(steps + 1, row, abreast)
+        check_memory("steps: expected fewer to be recorded", BYTES * WIDTH * row * (steps + 1), MOST_TRACE_BYTES)
+        return aligned(steps + 1, row * WIDTH).reshape(steps + 1, row, WIDTH)
 
     def run(
         self,
@@ -117,24 +110,26 @@ class Batch:
         """
         scripts = _NO_SCRIPT
         if script is not None:
-            scripts = aligned(1, script.size * self.kernel.abreast)
-            scripts[0] = np.repeat(script.ravel(), self.kernel.abreast)
-        traces = _NO_TRACE if trace is None else trace.reshape(1, -1)
-        assert traces.ctypes.data % LINE == 0 or not traces.size  # the kernel moves whole cache lines
-        self._call(scripts, traces, fresh, commands, observations, stands, drive, steps, last)
+            scripts = aligned(1, script.size * WIDTH)
+            scripts[0] = np.repeat(script.ravel(), WIDTH)
+        traces = _NO_TRACE
+        if trace is not None:
+            assert trace.ctypes.data % LINE == 0  # the kernel moves whole cache lines
+            traces = trace.reshape(1, -1)
+        words = words_of((scripts, traces, fresh, commands, observations, stands), PASSING)
+        run_blocks([*self._lasting(), *words, drive, self.steps, steps, last])
         self.steps += steps
 
-    def _call(
-        self, scripts: np.ndarray, traces: np.ndarray, fresh: np.ndarray, commands: np.ndarray,
-        observations: np.ndarray, stands: np.ndarray, drive: int, steps: int, last: int,
-    ) -> None:  # fmt: skip
-        """Calls the kernel."""
+    def _lasting(self) -> list[int]:
+        """The words of the arrays that stay from call to call."""
         kernel = self.kernel
-        run_blocks(
-            _width(), kernel.settings, kernel.tables, self._grounds, self.memory, self.brains, scripts, traces,
-            self.results, kernel.layouts, fresh, self.position, self.velocity, commands, observations, stands,
-            drive, self.steps, steps, last,
+        arrays = (
+            kernel.constants, kernel.layouts, kernel.tables, self._grounds, self.memory, self.brains, self.results,
+            self.position, self.velocity,
         )  # fmt: skip
+        if not all(map(operator.is_, arrays, self._told[0])):
+            self._told = arrays, words_of(arrays, LASTING)
+        return self._told[1]
 
     def begin(self, drive: int = CONTROLLER, **outputs: Any) -> None:
         """Puts all agents at the start."""
@@ -220,38 +215,10 @@ class Batch:
             buffer = state[name]
             vars(self)[name] = aligned(*buffer.shape)
             vars(self)[name][:] = buffer
+        self._told = [None], []
 
 
-@lru_cache
-def build_of_sources() -> str:
-    """A hash of the engine's sources."""
-    sources = sorted(Path(__file__).parent.glob("*.py"))
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:12]
-
-
-@lru_cache
-def _width() -> Width:
-    """The kernel's width, marked with its sources."""
-    return Width(WIDTH, build_of_sources())
-
-
-@lru_cache
 def load_kernel() -> None:
-    """Has the kernel ready, compiled or from the cache; says so if that takes a while."""
-    body = Body([[0.0, 0.0]])
-    task = Task(name="nothing", body=body, scene=Scene([]), position=body.position, condition="passive")
-    with notice_of_compilation("processor"):
-        Batch(World(task), np.zeros((0, 1, 2))).run(CONTROLLER, 0, 0)
-
-
-@contextmanager
-def notice_of_compilation(what: str) -> Generator[None]:
-    """Says so if what happens here takes a while."""
-    said = f"turgor: compiling the engine for this {what}, once ..."
-    notice = threading.Timer(1.5, print, [said], {"file": sys.stderr, "flush": True})
-    notice.daemon = True
-    notice.start()
-    try:
-        yield
-    finally:
-        notice.cancel()
+    """Has the kernel ready, from its file or compiled; says so if that takes a while."""
+    words = "turgor: compiling the engine for this processor, once ..."
+    load(before_making=lambda: print(words, file=sys.stderr, flush=True))

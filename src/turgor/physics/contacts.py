@@ -8,7 +8,8 @@ contacts are solved in the same order, whatever its neighbours do.
 
 import numpy as np
 
-from turgor.physics.lanes import any_lane, highest, inlined, lane_bits, lowest_bit, rare, select, select_mask, stage
+from turgor.physics.build import inlined, rare, stage
+from turgor.physics.lanes import any_lane, highest, lane_bits, lowest_bit, select, select_mask
 from turgor.physics.manifold import (
     NO_ID,
     face_on_segment,
@@ -19,8 +20,8 @@ from turgor.physics.manifold import (
     separation_of_squares,
     square_on_square,
 )
-from turgor.physics.memory import fill
 from turgor.physics.model import LOOK_AGAIN, MARGIN, NOWHERE
+from turgor.physics.views import fill
 
 FAR_BELOW = -1e9  # [m], where the segment of an empty slot lies
 

@@ -4,10 +4,11 @@ import math
 
 from numba import intp
 
-from turgor.physics.lanes import inlined, select, shared, stage
-from turgor.physics.memory import fill
+from turgor.physics.build import inlined, shared, stage
+from turgor.physics.lanes import select
 from turgor.physics.model import DISTRIBUTED, LINEAR, MLP, SINUSOID
 from turgor.physics.sense import clamp, signed
+from turgor.physics.views import fill
 
 
 @stage

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils, extending
 from numba.core.extending import (
     lower_builtin,
@@ -37,19 +37,6 @@ def intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
     return extending.intrinsic(function)
 
 
-# One of these above every function of the kernel. No fast-math: see above.
-_options: dict[str, Any] = {
-    "error_model": "numpy",
-    "boundscheck": False,
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-}
-stage = njit(forceinline=True, **_options)
-rare = njit(**_options)
-inlined = stage
-# Compiled once however many places call it: without the word, a function called from a stage is inlined like it.
-shared = njit(forceinline=False, **_options)
-
 # --- values -------------------------------------------------------------------------------------------------------
 
 ELEMENT = {"float": ir.FloatType(), "int": ir.IntType(32), "mask": ir.IntType(1)}
@@ -57,7 +44,7 @@ SCALAR = {"float": types.float32, "int": types.int32, "mask": types.boolean}
 
 
 class Lanes(types.Type):
-    """`width` numbers of one kind ("float", "int" or "mask") as one value: a vector, or a plain number of one lane."""
+    """`width` numbers of one kind ("float", "int" or "mask") as one value."""
 
     def __init__(self, kind: str, width: int) -> None:
         self.kind, self.width = kind, width
@@ -71,8 +58,8 @@ class Lanes(types.Type):
         return None
 
     @property
-    def llvm(self) -> ir.Type:
-        return ELEMENT[self.kind] if self.width == 1 else ir.VectorType(ELEMENT[self.kind], self.width)
+    def llvm(self) -> ir.VectorType:
+        return ir.VectorType(ELEMENT[self.kind], self.width)
 
 
 @register_model(Lanes)
@@ -82,8 +69,6 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _splat(builder: ir.IRBuilder, value: Any, width: int) -> ir.Value:
-    if width == 1:
-        return value
     empty = ir.Constant(ir.VectorType(value.type, width), ir.Undefined)
     first = builder.insert_element(empty, value, ir.IntType(32)(0))
     return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(ir.IntType(32), width), [0] * width))
@@ -151,8 +136,7 @@ def _comparison(symbol: str) -> Callable[..., ir.Value]:
 def _llvm_function(name: str) -> Callable[..., ir.Value]:
     def emit(builder: Any, lanes: Lanes, *values: Any) -> Any:
         kind = ir.FunctionType(lanes.llvm, [lanes.llvm] * len(values))
-        suffix = "f32" if lanes.width == 1 else f"v{lanes.width}f32"
-        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.{suffix}")
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{lanes.width}f32")
         return builder.call(function, values)
 
     return emit
@@ -164,21 +148,7 @@ for _operator, _float, _int in (("add", "fadd", "add"), ("sub", "fsub", "sub"), 
         _define(getattr(operator, _prefix + _operator), NUMBERS, _instruction(_float, _int))
 for _function in (operator.truediv, operator.itruediv):
     _define(_function, ("float",), lambda builder, lanes, a, b: builder.fdiv(a, b))
-
-
-def _negative(builder: Any, lanes: Lanes, a: Any) -> Any:
-    # one lane may be a GPU's, and NVVM knows neither fneg nor llvm.fabs
-    return builder.fsub(ir.Constant(lanes.llvm, -0.0), a) if lanes.width == 1 else builder.fneg(a)
-
-
-def _without_sign(builder: Any, lanes: Lanes, a: Any) -> Any:
-    if lanes.width > 1:
-        return _llvm_function("fabs")(builder, lanes, a)
-    bits = builder.bitcast(a, ir.IntType(32))
-    return builder.bitcast(builder.and_(bits, bits.type(0x7FFFFFFF)), lanes.llvm)
-
-
-_define(operator.neg, ("float",), _negative, arguments=1)
+_define(operator.neg, ("float",), lambda builder, lanes, a: builder.fneg(a), arguments=1)
 for _function, _symbol in (
     (operator.lt, "<"),
     (operator.gt, ">"),
@@ -195,7 +165,7 @@ _define(operator.invert, ("mask",), lambda builder, lanes, a: builder.not_(a), a
 # As the vector units do it: the second operand where the comparison does not hold, NaN included.
 _define(min, ("float",), lambda b, lanes, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
 _define(max, ("float",), lambda b, lanes, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))
-_define(abs, ("float",), _without_sign, arguments=1)
+_define(abs, ("float",), _llvm_function("fabs"), arguments=1)
 _define(math.sqrt, ("float",), _llvm_function("sqrt"), arguments=1)
 
 
@@ -247,7 +217,7 @@ def highest(typingctx: Any, value: Any) -> Any:
             high = builder.shuffle_vector(best, best, ir.Constant(places, [*range(half, 2 * half)]))
             best = builder.select(builder.fcmp_ordered(">", low, high), low, high)
             half //= 2
-        return best if value.width == 1 else builder.extract_element(best, ir.IntType(32)(0))
+        return builder.extract_element(best, ir.IntType(32)(0))
 
     return types.float32(value), emit
 

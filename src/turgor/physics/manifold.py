@@ -9,7 +9,8 @@ A point's id says what made it, so that its impulse can be found again in the ne
 and the corner 4 or 5 where the face's own first or second end cuts the other's edge.
 """
 
-from turgor.physics.lanes import any_lane, inlined, select
+from turgor.physics.build import inlined
+from turgor.physics.lanes import any_lane, select
 
 NO_POINT = 1e9  # [m], gap of a point that is not there
 NO_ID = -1.0

@@ -2,9 +2,9 @@
 
 import math
 
-from turgor.physics.lanes import inlined, stage
-from turgor.physics.memory import fill
+from turgor.physics.build import inlined, stage
 from turgor.physics.model import GAS_LAW, NOWHERE
+from turgor.physics.views import fill
 
 
 @stage

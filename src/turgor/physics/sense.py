@@ -1,7 +1,8 @@
 """Sensing: the present observation is pushed into the window, whose mean the controller sees."""
 
-from turgor.physics.lanes import any_lane, inlined, rare, select, stage
-from turgor.physics.memory import fill
+from turgor.physics.build import inlined, rare, stage
+from turgor.physics.lanes import any_lane, select
+from turgor.physics.views import fill
 
 
 @inlined

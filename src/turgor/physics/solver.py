@@ -11,10 +11,11 @@ cannot turn: velocities use the first, positions both.
 
 import math
 
-from turgor.physics.lanes import any_lane, inlined, select, stage
-from turgor.physics.memory import fill
+from turgor.physics.build import inlined, stage
+from turgor.physics.lanes import any_lane, select
 from turgor.physics.sense import clamp
 from turgor.physics.springs import solve_springs
+from turgor.physics.views import fill
 
 
 @stage

@@ -12,8 +12,9 @@ addition, and the rest need not wait:
 
 import math
 
-from turgor.physics.lanes import select, stage
-from turgor.physics.memory import fill
+from turgor.physics.build import stage
+from turgor.physics.lanes import select
+from turgor.physics.views import fill
 
 SLOP = 0.005  # [m], a shorter spring has no direction
 

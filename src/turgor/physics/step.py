@@ -1,25 +1,26 @@
 """The whole step, and the kernel that runs it for blocks of agents."""
 
-from functools import partial
-
 import numpy as np
-from numba import njit
+from numba import types
 
 from turgor.physics.actuate import actuate, agent_of, take_commands, take_lengths
+from turgor.physics.build import rare, stage
 from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, first_column, note_travel
 from turgor.physics.control import control
-from turgor.physics.lanes import any_lane, rare, select, stage
+from turgor.physics.engine import COUNTS, LASTING, PASSING
+from turgor.physics.lanes import any_lane, select
 from turgor.physics.manifold import NO_ID
-from turgor.physics.memory import agents_abreast, lane_count, lane_views, views
 from turgor.physics.model import (
     COMMANDS,
     CONTROLLER,
     UNKNOWN,
+    WIDTH,
     Brain,
     Ground,
     Model,
     Result,
     Script,
+    Settings,
     State,
     Trace,
     Work,
@@ -28,6 +29,7 @@ from turgor.physics.pressure import apply_forces, gas_law, signed_area
 from turgor.physics.sense import grow_older, sense
 from turgor.physics.solver import correct_positions, integrate, solve_velocities, warm_start_contacts
 from turgor.physics.springs import prepare_springs
+from turgor.physics.views import WidthType, lane_count, numbers, views
 
 
 @stage
@@ -180,33 +182,9 @@ def hand_out(settings, model, state, work, result, observations, stands, first):
         stands[agent, 5 * n + 2 * settings.chambers] = result.solved[0, lane]
 
 
-# inlined by Numba, not by LLVM: as a stage it would be compiled by itself as well, for a quarter more of the time
-@njit(inline="always")
-def run_block(
-    settings, model, ground, state, work, brain, result, script, trace, recording, fresh, position, velocity, commands,
-    observations, stands, drive, first, first_step, steps, last_step,
-):  # fmt: skip
-    """Runs the block of agents `first` ...: see `run_blocks`."""
-    row = 0
-    if len(fresh) > 0:
-        begin(settings, model, state, work, result, fresh, position, velocity, first, first_step)
-        if recording:
-            record(settings, state, work, trace, row)
-            row += 1
-    for k in range(steps):
-        t = first_step + k
-        step(settings, model, ground, state, work, brain, script, commands, drive, first, t, k)
-        if recording:
-            record(settings, state, work, trace, row)
-            row += 1
-        if note_end(settings, model, state, result, t, t == last_step):
-            break
-    if len(observations) > 0:
-        hand_out(settings, model, state, work, result, observations, stands, first)
-
-
-def _run_blocks(
-    width, settings, tables, grounds, memory, brains, scripts, traces, results, layouts, fresh, position, velocity,
+@rare
+def run_blocks(
+    width, constants, layouts, tables, grounds, memory, brains, results, position, velocity, scripts, traces, fresh,
     commands, observations, stands, drive, first_step, steps, last_step,
 ):  # fmt: skip
     """Runs every block of `memory` [block, size] for `steps` steps from `first_step`, after the agents that are `fresh`
@@ -216,47 +194,34 @@ def _run_blocks(
     `layouts` [view, field]. `commands` [agent, output] are those of the drive COMMANDS. Writes `results`, and `traces`,
     `observations`, `stands` if there is room for them.
     """
+    settings = numbers(Settings, constants)
     model = views(Model, tables, layouts[0], width)
-    script = views(Script, scripts[0], layouts[6], width)
-    trace = views(Trace, traces[0], layouts[6], width)
+    recording = traces.shape[1] > 0
     for block in range(len(memory)):
         ground = views(Ground, grounds[block if settings.own_ground != 0 else 0], layouts[1], width)
         state = views(State, memory[block], layouts[2], width)
         work = views(Work, memory[block], layouts[3], width)
         brain = views(Brain, brains[block], layouts[4], width)
         result = views(Result, results[block], layouts[5], width)
-        run_block(
-            settings, model, ground, state, work, brain, result, script, trace, traces.shape[1] > 0, fresh, position,
-            velocity, commands, observations, stands, drive, block * lane_count(width), first_step, steps, last_step,
-        )  # fmt: skip
+        script = views(Script, scripts[0], layouts[6], width)
+        trace = views(Trace, traces[0], layouts[6], width)
+        first = block * lane_count(width)
+        row = 0
+        if len(fresh) > 0:
+            begin(settings, model, state, work, result, fresh, position, velocity, first, first_step)
+            if recording:
+                record(settings, state, work, trace, row)
+                row += 1
+        for k in range(steps):
+            t = first_step + k
+            step(settings, model, ground, state, work, brain, script, commands, drive, first, t, k)
+            if recording:
+                record(settings, state, work, trace, row)
+                row += 1
+            if note_end(settings, model, state, result, t, t == last_step):
+                break
+        if len(observations) > 0:
+            hand_out(settings, model, state, work, result, observations, stands, first)
 
 
-@stage
-def run_agent(
-    agent, width, settings, tables, grounds, memory, brains, scripts, traces, results, layouts, fresh, position,
-    velocity, commands, observations, stands, drive, first_step, steps, last_step,
-):  # fmt: skip
-    """The same for one `agent` alone, with a `width` of one lane: what a thread of a GPU does."""
-    block = agent // agents_abreast(width)
-    lane = agent % agents_abreast(width)
-    model = views(Model, tables, layouts[0], width)
-    ground = views(Ground, grounds[0], layouts[1], width)
-    state = lane_views(State, memory[block], layouts[2], width, lane)
-    work = lane_views(Work, memory[block], layouts[3], width, lane)
-    brain = lane_views(Brain, brains[block], layouts[4], width, lane)
-    result = lane_views(Result, results[block], layouts[5], width, lane)
-    script = lane_views(Script, scripts[0], layouts[6], width, lane)
-    trace = lane_views(Trace, traces[0], layouts[6], width, lane)
-    run_block(
-        settings, model, ground, state, work, brain, result, script, trace, traces.shape[1] > 0, fresh, position,
-        velocity, commands, observations, stands, drive, agent, first_step, steps, last_step,
-    )  # fmt: skip
-
-
-# The cache knows `width`, and through it the sources of all that is called here: see memory.Width. Where no folder can
-# be written to, there is no cache.
-_compile = partial(njit, nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True)
-try:
-    run_blocks = _compile(cache=True)(_run_blocks)
-except RuntimeError:
-    run_blocks = _compile()(_run_blocks)
+ARGUMENTS = (WidthType(WIDTH), *LASTING.values(), *PASSING.values(), *(types.int64 for _ in COUNTS))

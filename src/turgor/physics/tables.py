@@ -23,7 +23,7 @@ from turgor.control import (
 from turgor.errors import InvalidInput
 from turgor.physics import model
 from turgor.physics.ground import Columns, Room
-from turgor.physics.memory import BYTES, Width, aligned, check_memory, field_of, fields, layout
+from turgor.physics.memory import BYTES, aligned, check_memory, field_of, fields, layout
 from turgor.physics.model import (
     CONTROLLED,
     DISTRIBUTED,
@@ -48,7 +48,6 @@ from turgor.task import Leave, Task
 
 LARGEST = float(np.finfo(np.float32).max)
 LEAST_PRESSURE = 1e-30  # [Pa]
-ON_CPU = Width(WIDTH)
 KINDS: dict[type, int] = {Linear: LINEAR, MLP: model.MLP, Sinusoid: SINUSOID, Distributed: DISTRIBUTED}
 
 
@@ -56,14 +55,14 @@ class Kernel(NamedTuple):
     """A task as the kernel sees it, in Python: settings, tables, and the layout of a block's memory."""
 
     settings: Settings
+    constants: np.ndarray  # the settings as the kernel reads them, float32 and int32 in one array [setting]
     tables: np.ndarray  # float32 [size]
     layouts: np.ndarray  # offsets of the fields of VIEWS and where each ends, [view, field]
     lengths: dict[str, int]
-    abreast: int = WIDTH  # agents of a block, side by side in its memory
 
     def field(self, buffer: np.ndarray, view: type, name: str) -> np.ndarray:
         """A field of a `view` in one block's `buffer`, writable: [length, lane], or [length] for tables."""
-        width = 1 if view in SHARED else self.abreast
+        width = 1 if view in SHARED else WIDTH
         return field_of(buffer, view, self.layouts[VIEWS.index(view)], name, self.lengths, width)
 
     def size(self, view: type) -> int:
@@ -100,9 +99,8 @@ class Kernel(NamedTuple):
         }
 
 
-def make_kernel(task: Task, room: Room, own_ground: bool = False, width: Width = ON_CPU) -> Kernel:
-    """The `Kernel` of a task, with `room` for a scene that all agents share, or for one of each agent's own, and
-    memory for lanes of a `width`."""
+def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
+    """The `Kernel` of a task, with `room` for a scene that all agents share, or for one of each agent's own."""
     body, physics = task.body, task.physics
     tables: dict[str, np.ndarray] = {}
     tables |= _mass_tables(body)
@@ -130,13 +128,13 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False, width: Width =
         "window": observation_count(body) * task.sensing.window,
     }
     lengths |= _controller_lengths(task)
-    layouts = _layouts(lengths, width)
+    layouts = _layouts(lengths)
     for k, view in enumerate(VIEWS):
         expected = "task: expected fewer masses, springs, segments, hidden units, messages or a shorter window"
-        check_memory(f"{expected} ({width.stride} agents' {view.__name__.lower()})", BYTES * int(layouts[k].max()))
+        check_memory(f"{expected} ({WIDTH} agents' {view.__name__.lower()})", BYTES * int(layouts[k].max()))
     buffer = aligned(1, layouts[0, len(fields(Model))])[0]
     settings = Settings(
-        lanes=np.int32(width),
+        lanes=np.int32(WIDTH),
         masses=np.int32(body.mass_count),
         springs=np.int32(body.spring_count),
         chambers=np.int32(body.chamber_count),
@@ -171,7 +169,7 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False, width: Width =
         velocity_scale=np.float32(1 / task.sensing.velocity_scale),
         half_width=np.float32(task.end.half_width if isinstance(task.end, Leave) else math.inf),
     )
-    kernel = Kernel(settings, buffer, layouts, lengths, width.stride)
+    kernel = Kernel(settings, _constants(settings), buffer, layouts, lengths)
     for name, values in tables.items():
         if (np.isfinite(values) & (np.abs(values) > LARGEST)).any():
             raise InvalidInput(f"{name}: expected numbers within {LARGEST:.0e}", f"{np.abs(values).max():.3g}")
@@ -204,14 +202,19 @@ def write_ground(tables: dict[str, np.ndarray], scene: Columns, place: int = 0) 
 _BEYOND = {"left": math.inf, "right": math.inf, "floor": -math.inf, "ceiling": math.inf}
 
 
-def _layouts(lengths: dict[str, int], width: Width) -> np.ndarray:
+def _layouts(lengths: dict[str, int]) -> np.ndarray:
     """Offsets of every view; Work stands behind State in the same buffer."""
-    rows = [layout(view, lengths, 1 if view in SHARED else width.stride, int(width)) for view in VIEWS]
+    rows = [layout(view, lengths, 1 if view in SHARED else WIDTH) for view in VIEWS]
     rows[VIEWS.index(Work)] += rows[VIEWS.index(State)][-1]
     table = np.zeros((len(rows), max(len(row) for row in rows)), dtype=np.int64)
     for k, row in enumerate(rows):
         table[k, : len(row)] = row
     return table
+
+
+def _constants(settings: Settings) -> np.ndarray:
+    """The settings, one behind the other."""
+    return np.frombuffer(b"".join(number.tobytes() for number in settings), dtype=np.float32)
 
 
 def _pressure_source(task: Task) -> int:
