@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Sequence
+from typing import Any
 
 import llvmlite.binding as llvm
 import numpy as np
 from llvmlite import ir
 
+from turgor.physics import driver
+
 I1, I8, I32, I64 = (ir.IntType(bits) for bits in (1, 8, 32, 64))
 F32, F64 = ir.FloatType(), ir.DoubleType()
 WORD = re.compile(r"[^\s,]+")
 SPECIAL = ("%tid.x", "%ctaid.x", "%ntid.x")
+OUT_OF_MEMORY, INVALID_PTX = 2, 218  # errors of the driver
 SIZES = {"8": 1, "16": 2, "32": 4, "64": 8}
 ORDERED = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 UNORDERED = {"equ": "==", "neu": "!=", "ltu": "<", "leu": "<=", "gtu": ">", "geu": ">="}
@@ -36,14 +39,18 @@ class Kernel:
     """The one kernel of a PTX text, compiled for this processor."""
 
     def __init__(self, ptx: str) -> None:
-        head, body = re.search(r"\.entry \w+\((.*?)\)(?:\s*\.\w+[^{]*)?\{(.*)\}", ptx, re.DOTALL).groups()
-        self.parameters = re.findall(r"\.param \.(\w+) (\w+)", head)  # type and name, in order
+        text = re.sub(r"//[^\n]*", "", ptx)
+        entry = re.search(r"\.entry (\w+)\((.*?)\)\s*\.maxntid (\d+)[^{]*\{(.*)\}", text, re.DOTALL)
+        self.name, head, most, body = entry.groups()
+        self.most_threads = int(most)
         self._offsets, at = {}, 0
-        for kind, name in self.parameters:
+        for alignment, kind, name, length in re.findall(
+            r"\.param (?:\.align (\d+) )?\.(\w+) (\w+)(?:\[(\d+)\])?", head
+        ):
             size = SIZES[kind[1:]]
-            at = -(-at // size) * size
-            self._offsets[name] = at, kind
-            at += size
+            at = -(-at // int(alignment or size)) * int(alignment or size)
+            self._offsets[name] = at
+            at += size * int(length or 1)
         self.parameter_bytes = at
         self.instructions = [text.strip() for text in body.replace(":", ":;").split(";") if text.strip()]
         self._translate()
@@ -75,7 +82,9 @@ class Kernel:
                 self._go(self._blocks[text[:-1]])
             elif text.startswith(".reg"):
                 self._declare(text)
-            elif not text.startswith((".loc", "{", "}", ".pragma")):
+            elif text.startswith(".branchtargets"):
+                self._targets = [self._blocks[label] for label in WORD.findall(text)[1:]]
+            else:
                 self._instruction(function, text)
         self._start.branch(first)
 
@@ -109,14 +118,28 @@ class Kernel:
         operands = WORD.findall(rest)
         if operation == "bra":
             self.builder.branch(self._blocks[operands[0]])
-        elif operation == "ret":
+        elif operation == "brx":  # to one of the targets listed just before
+            self._branch_to_any(self._value(operands[0], I32))
+        elif operation in ("ret", "exit"):
             self.builder.ret_void()
+        elif operation == "ld" and kinds[1] == "v2":
+            size = SIZES[kinds[2][1:]]
+            for k, register in enumerate(operands[:2]):
+                self._put(register.strip("{}"), self._load(kinds, f"{operands[2].strip('[]')}+{k * size}"))
         elif operation == "st":
             assert kinds[0] == "global"
             kind = type_of(kinds[-1])
             self.builder.store(self._value(operands[1], kind), self._address(operands[0], kind))
         else:
             self._put(operands[0], getattr(self, f"_{operation}")(kinds, operands[1:]))
+
+    def _branch_to_any(self, number: ir.Value) -> None:
+        here, beyond = self.builder, self.builder.append_basic_block()
+        switch = here.switch(number, beyond)
+        for k, target in enumerate(self._targets):
+            switch.add_case(k, target)
+        here.position_at_end(beyond)
+        here.unreachable()
 
     def _put(self, register: str, value: ir.Value) -> None:
         place = self._registers[register]
@@ -149,29 +172,28 @@ class Kernel:
         return kind(int(operand, 0))
 
     def _address(self, operand: str, kind: ir.Type) -> ir.Value:
-        base, _, offset = operand.strip("[]").partition("+")
-        address = self.builder.add(self._value(base, I64), I64(int(offset or 0)))
-        return self.builder.inttoptr(address, kind.as_pointer())
+        base, *offsets = operand.strip("[]").split("+")
+        start = self._parameter(base) if base in self._offsets else self._value(base, I64)
+        return self.builder.inttoptr(self.builder.add(start, I64(sum(map(int, offsets)))), kind.as_pointer())
+
+    def _parameter(self, name: str) -> ir.Value:
+        """Where a parameter is."""
+        return self.builder.add(self.builder.ptrtoint(self._arguments, I64), I64(self._offsets[name]))
 
     # --- instructions -----------------------------------------------------------------------------------------
 
     def _ld(self, kinds: list[str], operands: list[str]) -> ir.Value:
-        kind = type_of(kinds[-1])
-        if kinds[0] == "param":
-            at, declared = self._offsets[operands[0].strip("[]")]
-            assert SIZES[declared[1:]] == SIZES[kinds[-1][1:]]
-            place = self.builder.gep(self._arguments, [I32(at)])
-            return self.builder.load(self.builder.bitcast(place, kind.as_pointer()))
-        assert kinds[0] == "global"
-        value = self.builder.load(self._address(operands[0], kind))
+        return self._load(kinds, operands[0])
+
+    def _load(self, kinds: list[str], operand: str) -> ir.Value:
+        assert kinds[0] in ("param", "global")
+        value = self.builder.load(self._address(operand, type_of(kinds[-1])))
         return self.builder.sext(value, I32) if kinds[-1] in ("s8", "s16") else value
 
     def _mov(self, kinds: list[str], operands: list[str]) -> ir.Value:
-        return self._value(operands[0], type_of(kinds[-1]))
-
-    def _cvta(self, kinds: list[str], operands: list[str]) -> ir.Value:
-        assert kinds == ["to", "global", "u64"]
-        return self._value(operands[0], I64)
+        return (
+            self._parameter(operands[0]) if operands[0] in self._offsets else self._value(*operands, type_of(kinds[-1]))
+        )
 
     def _cvt(self, kinds: list[str], operands: list[str]) -> ir.Value:
         given, wanted = kinds[-1], kinds[-2]
@@ -210,6 +232,11 @@ class Kernel:
         widen = self.builder.sext if kinds[1][0] == "s" else self.builder.zext
         a, b = (widen(self._value(operand, narrow), wide) for operand in operands)
         return self.builder.mul(a, b)
+
+    def _mad(self, kinds: list[str], operands: list[str]) -> ir.Value:
+        assert kinds[0] == "lo"
+        product = self._arithmetic(kinds, operands[:2], "", "mul")
+        return self.builder.add(product, self._value(operands[2], type_of(kinds[-1])))
 
     def _div(self, kinds: list[str], operands: list[str]) -> ir.Value:
         return self._arithmetic(kinds, operands, "fdiv", "sdiv" if kinds[-1][0] == "s" else "udiv")
@@ -302,14 +329,6 @@ class Kernel:
         assert 0 <= int(operands[1], 0) < kind.width
         return getattr(self.builder, operation)(self._value(operands[0], kind), kind(int(operands[1], 0)))
 
-    def _bfi(self, kinds: list[str], operands: list[str]) -> ir.Value:
-        kind = type_of(kinds[-1])
-        field, base = (self._value(operand, kind) for operand in operands[:2])
-        at, count = (int(operand, 0) for operand in operands[2:])
-        mask = ((1 << count) - 1) << at
-        inserted = self.builder.and_(self.builder.shl(field, kind(at)), kind(mask))
-        return self.builder.or_(inserted, self.builder.and_(base, kind(~mask & (2**kind.width - 1))))
-
     # --- compilation ------------------------------------------------------------------------------------------
 
     def _compile(self) -> None:
@@ -326,46 +345,98 @@ class Kernel:
         self._function = ctypes.CFUNCTYPE(None, ctypes.c_char_p, *[ctypes.c_int32] * 3)(address)
 
 
-class Memory:
-    """An array of the machine."""
+class Driver:
+    """NVIDIA's driver, as `turgor.physics.driver` calls it, of one such machine. Its memory is the CPU's."""
 
-    def __init__(self, array: np.ndarray) -> None:
-        self.array = array
-        self.shape, self.itemsize, self.size, self.nbytes = array.shape, array.itemsize, array.size, array.nbytes
-        self.address = array.ctypes.data if array.size else 0
-
-
-class Machine:
-    """What `turgor.physics.driver.Device` does, for a kernel that runs here."""
-
-    name = "a machine for PTX"
-
-    def __init__(self, compute_capability: tuple[int, int]) -> None:
-        self.compute_capability = compute_capability
+    def __init__(self, memory: int = 2**30) -> None:
+        self.memory = memory  # [byte], that it says is free
         self.launches = 0
+        self._rooms: dict[int, np.ndarray] = {}
+        for name, kinds in driver.FUNCTIONS.items():
+            setattr(self, name, ctypes.CFUNCTYPE(ctypes.c_int, *kinds)(getattr(self, f"_{name}")))
 
-    def load(self, ptx: str) -> None:
-        self.kernel = Kernel(ptx)
+    @property
+    def used(self) -> int:
+        """Memory that is in use [byte]."""
+        return sum(room.nbytes for room in self._rooms.values())
 
-    def free_bytes(self) -> int:
-        return 2**30
+    def _cuInit(self, flags: int) -> int:
+        return 0
 
-    def zeros(self, shape: Sequence[int], itemsize: int = 4) -> Memory:
-        assert itemsize == 4
-        return Memory(np.zeros(shape, np.float32))
+    def _cuGetErrorName(self, error: int, out: Any) -> int:
+        out[0] = {OUT_OF_MEMORY: b"CUDA_ERROR_OUT_OF_MEMORY", INVALID_PTX: b"CUDA_ERROR_INVALID_PTX"}[error]
+        return 0
 
-    def upload(self, array: np.ndarray) -> Memory:
-        return Memory(array.copy())
+    def _cuDeviceGet(self, out: Any, number: int) -> int:
+        out[0] = number
+        return 0
 
-    def download(self, memory: Memory, array: np.ndarray) -> None:
-        array[...] = memory.array
+    def _cuDeviceGetName(self, out: int, size: int, device: int) -> int:
+        name = b"a machine for PTX\0"
+        assert len(name) <= size
+        ctypes.memmove(out, name, len(name))
+        return 0
 
-    def launch(self, grid: int, block: int, arguments: Sequence[tuple[type, float]]) -> None:
-        assert len(arguments) == len(self.kernel.parameters)
-        packed = bytearray()
-        for (kind, value), (declared, _) in zip(arguments, self.kernel.parameters, strict=True):
-            assert ctypes.sizeof(kind) == SIZES[declared[1:]]
-            assert (kind is ctypes.c_float) == (declared[0] == "f")
-            packed += bytes(-len(packed) % ctypes.sizeof(kind)) + bytes(kind(value))
-        self.kernel.run(bytes(packed), grid, block)
+    def _cuDevicePrimaryCtxRetain(self, out: Any, device: int) -> int:
+        out[0] = 1
+        return 0
+
+    def _cuCtxSetCurrent(self, context: int) -> int:
+        assert context == 1
+        return 0
+
+    def _cuCtxSynchronize(self) -> int:
+        return 0
+
+    def _cuModuleLoadDataEx(self, out: Any, text: bytes, count: int, options: Any, values: Any) -> int:
+        assert [options[k] for k in range(count)] == [5, 6]  # of which the driver knows where errors are to be written
+        if b".entry" not in text:
+            ctypes.memmove(values[0], b"line 1: no entry\0", 17)
+            return INVALID_PTX
+        self.kernel = Kernel(text.decode())
+        out[0] = 2
+        return 0
+
+    def _cuModuleGetFunction(self, out: Any, module: int, name: bytes) -> int:
+        assert (module, name.decode()) == (2, self.kernel.name)
+        out[0] = 3
+        return 0
+
+    def _cuMemGetInfo_v2(self, free: Any, total: Any) -> int:
+        free[0] = total[0] = self.memory
+        return 0
+
+    def _cuMemAlloc_v2(self, out: Any, size: int) -> int:
+        if size > self.memory:
+            return OUT_OF_MEMORY
+        room = np.full(size, 0xAB, np.uint8)
+        self._rooms[room.ctypes.data] = room
+        out[0] = room.ctypes.data
+        return 0
+
+    def _cuMemFree_v2(self, address: int) -> int:
+        del self._rooms[address]
+        return 0
+
+    def _cuMemsetD8_v2(self, address: int, value: int, size: int) -> int:
+        assert size == self._rooms[address].nbytes
+        self._rooms[address][:] = value
+        return 0
+
+    def _cuMemcpyHtoD_v2(self, to: int, here: int, size: int) -> int:
+        assert size == self._rooms[to].nbytes
+        ctypes.memmove(to, here, size)
+        return 0
+
+    def _cuMemcpyDtoH_v2(self, to: int, here: int, size: int) -> int:
+        assert size == self._rooms[here].nbytes
+        ctypes.memmove(to, here, size)
+        return 0
+
+    def _cuLaunchKernel(self, function: int, *launch: Any) -> int:
+        blocks, y, z, threads, below, behind, shared, stream, arguments, extra = launch
+        assert (function, y, z, below, behind, shared, stream, bool(extra)) == (3, 1, 1, 1, 1, 0, None, False)
+        assert threads <= self.kernel.most_threads
+        self.kernel.run(ctypes.string_at(arguments[0], self.kernel.parameter_bytes), blocks, threads)
         self.launches += 1
+        return 0

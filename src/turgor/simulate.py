@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -400,9 +399,7 @@ def perturbed(position: np.ndarray, repeats: int, size: float = 1e-6) -> np.ndar
 
 
 def open_gpu() -> Gpu:
-    """The first GPU of this machine. Raises `InvalidInput` without one, or without what it takes to compile for it."""
-    if find_spec("numba_cuda") is None:
-        raise InvalidInput("device: expected the packages for 'cuda'; pip install 'turgor[cuda]'", "no numba-cuda")
+    """The first GPU of this machine. Raises `InvalidInput` without one."""
     from turgor.physics.gpu import first_gpu
 
     return first_gpu()

@@ -1,36 +1,55 @@
-"""What the engine asks of the CUDA driver: memory, transfers, launches. One GPU, one call after the other."""
+"""What the engine asks of NVIDIA's driver: memory, copies, launches. One GPU, one call after the other."""
 
 from __future__ import annotations
 
 import ctypes
-import re
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from ctypes import POINTER, byref, c_char_p, c_int, c_size_t, c_uint, c_uint64, c_void_p
+from functools import cache
 from typing import Any
 
 import numpy as np
-from cuda.bindings import driver
 
 from turgor.errors import InvalidInput
 
-Argument = tuple[Any, float]  # of a kernel: its C type (see ctypes) and value
+LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+# NVIDIA's CUDA Driver API: the functions in use, as cuda.h declares them; each returns 0 or the number of an error.
+FUNCTIONS: dict[str, Sequence[Any]] = {
+    "cuInit": [c_uint],
+    "cuGetErrorName": [c_int, POINTER(c_char_p)],
+    "cuDeviceGet": [POINTER(c_int), c_int],
+    "cuDeviceGetName": [c_void_p, c_int, c_int],
+    "cuDevicePrimaryCtxRetain": [POINTER(c_void_p), c_int],
+    "cuCtxSetCurrent": [c_void_p],
+    "cuCtxSynchronize": [],
+    "cuModuleLoadDataEx": [POINTER(c_void_p), c_char_p, c_uint, POINTER(c_int), POINTER(c_void_p)],
+    "cuModuleGetFunction": [POINTER(c_void_p), c_void_p, c_char_p],
+    "cuMemGetInfo_v2": [POINTER(c_size_t), POINTER(c_size_t)],
+    "cuMemAlloc_v2": [POINTER(c_uint64), c_size_t],
+    "cuMemFree_v2": [c_uint64],
+    "cuMemsetD8_v2": [c_uint64, ctypes.c_ubyte, c_size_t],
+    "cuMemcpyHtoD_v2": [c_uint64, c_void_p, c_size_t],
+    "cuMemcpyDtoH_v2": [c_void_p, c_uint64, c_size_t],
+    "cuLaunchKernel": [c_void_p, *[c_uint] * 7, c_void_p, POINTER(c_void_p), POINTER(c_void_p)],
+}
+ERROR_LOG, ERROR_LOG_SIZE = 5, 6  # options of the driver's assembler
+LOG_BYTES, MOST_SAID = 4096, 300  # of its errors, and of what is told of them
 
 
 class Memory:
     """An array on the device, C order; freed when nobody refers to it any more."""
 
-    def __init__(self, address: int, shape: Sequence[int], itemsize: int, free: Callable[[int], None]) -> None:
-        self.address, self.shape, self.itemsize = address, tuple(shape), itemsize
+    def __init__(self, address: int, array: np.ndarray, free: Callable[[int], None]) -> None:
+        self.address, self.shape, self.nbytes = address, array.shape, array.nbytes
         self._free = free
 
     @property
-    def size(self) -> int:
-        return int(np.prod(self.shape, dtype=np.int64))
-
-    @property
-    def nbytes(self) -> int:
-        return self.size * self.itemsize
+    def words(self) -> list[int]:
+        """What the kernel is told of it, as in `engine.words_of`."""
+        return [self.address, *self.shape]
 
     def __del__(self) -> None:
         if self.address:
@@ -41,44 +60,51 @@ class Device:
     """A GPU. Raises `InvalidInput` where there is none, or where it fails."""
 
     def __init__(self, number: int = 0) -> None:
+        device, context, name = c_int(), c_void_p(), ctypes.create_string_buffer(128)
         try:
-            _ask(driver.cuInit(0))
-            self._device = _ask(driver.cuDeviceGet(number))
-        except (InvalidInput, RuntimeError, OSError) as error:
+            ask("cuInit", 0)
+            ask("cuDeviceGet", byref(device), number)
+        except (InvalidInput, OSError, AttributeError) as error:  # AttributeError: an old driver
             raise InvalidInput("device: expected an NVIDIA GPU and its driver for 'cuda'", str(error)) from None
-        attribute = driver.CUdevice_attribute
-        self.compute_capability = (
-            _ask(driver.cuDeviceGetAttribute(attribute.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR, self._device)),
-            _ask(driver.cuDeviceGetAttribute(attribute.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR, self._device)),
-        )
-        self.name = _ask(driver.cuDeviceGetName(128, self._device)).split(b"\0")[0].decode()
-        self._context = _ask(driver.cuDevicePrimaryCtxRetain(self._device))
+        ask("cuDeviceGetName", name, len(name), device)
+        ask("cuDevicePrimaryCtxRetain", byref(context), device)
+        self.name = name.value.decode()
         self.busy = 0.0  # [s], in launches so far
+        self._context = context
 
-    def load(self, code: bytes) -> None:
-        """Has the one kernel of this machine code ready."""
+    def load(self, ptx: bytes, entry: str) -> None:
+        """Has the kernel `entry` of a PTX text ready. The driver makes machine code of it, and keeps that."""
         self._enter()
-        image = np.frombuffer(code, np.uint8)
-        self._module = _ask(driver.cuModuleLoadData(image.ctypes.data))
-        self._kernel = _ask(driver.cuModuleGetFunction(self._module, entry_of(code)))
+        module, kernel, log = c_void_p(), c_void_p(), ctypes.create_string_buffer(LOG_BYTES)
+        options = (c_int * 2)(ERROR_LOG, ERROR_LOG_SIZE)
+        values = (c_void_p * 2)(ctypes.addressof(log), LOG_BYTES)
+        error = call("cuModuleLoadDataEx", byref(module), ptx, len(options), options, values)
+        if error:
+            said = " ".join(log.value.decode(errors="replace").split())
+            raise InvalidInput("device: expected a GPU that can run the engine", f"{error} {said[:MOST_SAID]}".strip())
+        ask("cuModuleGetFunction", byref(kernel), module, entry.encode())
+        self._kernel = kernel
 
     def free_bytes(self) -> int:
+        """Memory that is free [byte]."""
         self._enter()
-        return int(_ask(driver.cuMemGetInfo())[0])
-
-    def zeros(self, shape: Sequence[int], itemsize: int = 4) -> Memory:
-        """Room for an array."""
-        memory = self._room(shape, itemsize)
-        if memory.nbytes:
-            _ask(driver.cuMemsetD8(memory.address, 0, memory.nbytes))
-        return memory
+        free, total = c_size_t(), c_size_t()
+        ask("cuMemGetInfo_v2", byref(free), byref(total))
+        return free.value
 
     def upload(self, array: np.ndarray) -> Memory:
         """A copy of `array` [C order] on the device."""
         assert array.flags.c_contiguous
-        memory = self._room(array.shape, array.itemsize)
+        memory = self._room(array)
         if memory.nbytes:
-            _ask(driver.cuMemcpyHtoD(memory.address, array.ctypes.data, memory.nbytes))
+            ask("cuMemcpyHtoD_v2", memory.address, array.ctypes.data, memory.nbytes)
+        return memory
+
+    def zeros(self, shape: Sequence[int]) -> Memory:
+        """Room for float32 of a `shape`."""
+        memory = self._room(np.broadcast_to(np.float32(0), shape))
+        if memory.nbytes:
+            ask("cuMemsetD8_v2", memory.address, 0, memory.nbytes)
         return memory
 
     def download(self, memory: Memory, array: np.ndarray) -> None:
@@ -87,56 +113,53 @@ class Device:
         assert array.nbytes == memory.nbytes
         self._enter()
         if memory.nbytes:
-            _ask(driver.cuMemcpyDtoH(array.ctypes.data, memory.address, memory.nbytes))
+            ask("cuMemcpyDtoH_v2", array.ctypes.data, memory.address, memory.nbytes)
 
-    def launch(self, grid: int, block: int, arguments: Sequence[Argument]) -> None:
+    def launch(self, grid: int, block: int, argument: bytes) -> None:
         """Runs the kernel in `grid` blocks of `block` threads, to the end."""
         self._enter()
-        values, kinds = tuple(value for _, value in arguments), tuple(kind for kind, _ in arguments)
+        arguments = (c_void_p * 1)(ctypes.cast(c_char_p(argument), c_void_p))
         began = time.perf_counter()
-        _ask(driver.cuLaunchKernel(self._kernel, grid, 1, 1, block, 1, 1, 0, 0, (values, kinds), 0))
-        _ask(driver.cuCtxSynchronize())
+        ask("cuLaunchKernel", self._kernel, grid, 1, 1, block, 1, 1, 0, None, arguments, None)
+        ask("cuCtxSynchronize")
         self.busy += time.perf_counter() - began
 
-    def _room(self, shape: Sequence[int], itemsize: int) -> Memory:
+    def _room(self, array: np.ndarray) -> Memory:
         self._enter()
-        size = int(np.prod(shape, dtype=np.int64)) * itemsize
-        address = int(_ask(driver.cuMemAlloc(size))) if size else 0
-        return Memory(address, shape, itemsize, self._free)
+        address = c_uint64()
+        if array.nbytes:
+            ask("cuMemAlloc_v2", byref(address), array.nbytes)
+        return Memory(address.value, array, self._free)
 
     def _free(self, address: int) -> None:
         with suppress(InvalidInput):  # the process ends
             self._enter()
-            _ask(driver.cuMemFree(address))
+            ask("cuMemFree_v2", address)
 
     def _enter(self) -> None:
         """Makes this the device of the calling thread."""
-        _ask(driver.cuCtxSetCurrent(self._context))
+        ask("cuCtxSetCurrent", self._context)
 
 
-def entry_of(code: bytes) -> bytes:
-    """The name of the kernel, which alone has a section of such a name."""
-    found = re.search(rb"\0\.nv\.constant0\.(\w+)\0", code)
-    assert found is not None
-    return found[1]
+def ask(name: str, *values: Any) -> None:
+    """Calls a function of the driver. Raises `InvalidInput` for an error, `OSError` without a driver."""
+    error = call(name, *values)
+    if error:
+        raise InvalidInput("device: expected the GPU to do its work", error)
 
 
-def flat(array: Memory) -> list[Argument]:
-    """An array as a kernel of Numba takes it."""
-    strides = [array.itemsize * int(np.prod(array.shape[k + 1 :], dtype=np.int64)) for k in range(len(array.shape))]
-    numbers = [array.size, array.itemsize]
-    return [
-        (ctypes.c_void_p, 0),  # its owner, and whose part it is
-        (ctypes.c_void_p, 0),
-        *((ctypes.c_int64, number) for number in numbers),
-        (ctypes.c_void_p, array.address),
-        *((ctypes.c_int64, number) for number in (*array.shape, *strides)),
-    ]
+def call(name: str, *values: Any) -> str:
+    """Calls a function of the driver; returns the name of its error, empty if there is none."""
+    error, called = getattr(library(), name)(*values), c_char_p()
+    if error:
+        library().cuGetErrorName(error, byref(called))
+    return (called.value or b"%d" % error).decode() if error else ""
 
 
-def _ask(answer: tuple[Any, ...]) -> Any:
-    """What the driver answers: nothing, a value or several. Raises `InvalidInput` for an error."""
-    error, *values = answer
-    if error != driver.CUresult.CUDA_SUCCESS:
-        raise InvalidInput("device: expected the GPU to do its work", error.name)
-    return values[0] if len(values) == 1 else tuple(values)
+@cache
+def library() -> Any:
+    """The driver's functions. Raises `OSError` without one."""
+    found = ctypes.CDLL(LIBRARY)
+    for name, kinds in FUNCTIONS.items():
+        getattr(found, name).argtypes, getattr(found, name).restype = kinds, c_int
+    return found
