@@ -1,41 +1,43 @@
-"""How fast the engine runs on this machine's GPU: `python benchmarks/gpu.py`, about five minutes.
+"""Does the engine run on this machine's GPU, with the CPU's bits, and how fast? `python benchmarks/gpu.py`
 
-Needs an NVIDIA GPU and the extra `cuda`. First some agents of each kind run on the CPU as well, and their bits are
-compared. Then whole rollouts of 1800 steps on hilly ground for growing batches, the fastest of several: "kernel"
-counts the time in the GPU's code, "call" also what goes there and back. Controllers: "random" has theta uniform in
-[-1, 1], "inflated" the same with pressure moving by 1 Pa per unit of output, so that bodies keep their gas. theta is
-float32.
+Needs an NVIDIA GPU and its driver. First what was found, and how long it took to make PTX and to have the driver
+assemble it. Then tests/test_cuda.py, which compares bits on that GPU. Then whole rollouts of 1800 steps on hilly ground
+for growing batches, the fastest of several: "kernel" counts the time in the GPU's code, "call" also what goes there and
+back. Controllers: "random" has theta uniform in [-1, 1], "inflated" the same with pressure moving by 1 Pa per unit of
+output, so that bodies keep their gas. theta is float32. The rates are measured even where tests fail; the exit status
+is then 1.
 """
 
 import argparse
 import csv
+import subprocess
 import sys
 import time
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 
 import turgor
-from turgor.simulate import open_gpu
+from turgor.bench.parts import controllers, make_task
+from turgor.physics.driver import Device
+from turgor.physics.engine import ENTRY, PTX, code_of
+from turgor.physics.gpu import first_gpu
 
-KINDS = {"random": {}, "inflated": {"pressure_unit": 1.0}}
-COLUMNS = ("device", "date", "turgor", "body", "controllers", "batch", "kernel", "call", "seconds", "same_bits")
-
-
-def simulators(body, kind, steps):
-    """A simulator on either device, and what draws controllers for them."""
-    task = turgor.make_task("hilly", body=body, steps=steps, **KINDS[kind])
-
-    def theta(agents):
-        return np.random.default_rng(0).uniform(-1, 1, (agents, task.parameter_count)).astype(np.float32)
-
-    return turgor.Simulator(task, device="cuda"), turgor.Simulator(task), theta
+TESTS = Path(__file__).parents[1] / "tests" / "test_cuda.py"
+COLUMNS = ("device", "date", "turgor", "body", "controllers", "batch", "kernel", "call", "seconds")
 
 
-def same_bits(gpu, cpu, theta):
-    """Whether agents end at the same bits, and how far apart they end at most [m]."""
-    mine, expected = (simulator.rollout(theta).position for simulator in (gpu, cpu))
-    return mine.tobytes() == expected.tobytes(), float(np.abs(mine - expected).max())
+def look() -> Device:
+    """This machine's GPU, after telling of it."""
+    device = Device()
+    print(f"{device.name}, {device.free_bytes() / 1e9:.1f} GB of memory are free")
+    began = time.perf_counter()
+    code = code_of(PTX, lambda: None)
+    made = time.perf_counter()
+    device.load(code, ENTRY)
+    print(f"PTX: {made - began:.1f} s; assembled by the driver, which keeps it: {time.perf_counter() - made:.1f} s")
+    return first_gpu().device
 
 
 def fastest(simulator, device, theta, repeats):
@@ -49,32 +51,40 @@ def fastest(simulator, device, theta, repeats):
     return steps / min(kernels) / 1e6, steps / min(calls) / 1e6, min(calls)
 
 
+def measure(device, options):
+    """Rows of COLUMNS."""
+    print("million agent-steps/s:")
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    for body in options.bodies:
+        for kind in ("random", "inflated"):
+            task = make_task("hilly", body, options.steps, kind)
+            simulator = turgor.Simulator(task, device="cuda")
+            for batch in options.batches:
+                theta = controllers(kind, task, batch, 0).astype(np.float32)
+                rates = fastest(simulator, device, theta, options.repeats)
+                kernel, call, seconds = (f"{number:.4g}" for number in rates)
+                print(
+                    f"{body:>6} {kind:>9} {batch:>8} agents  kernel {kernel:>7}  call {call:>7}  {seconds:>6} s",
+                    flush=True,
+                )
+                yield [device.name, today, turgor.__version__, body, kind, batch, kernel, call, seconds]
+
+
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--bodies", nargs="+", default=["large", "small"])
 parser.add_argument("--batches", nargs="+", type=int, default=[1024, 4096, 16_384, 65_536, 262_144])
 parser.add_argument("--repeats", type=int, default=3)
 parser.add_argument("--steps", type=int, default=1800)
-parser.add_argument("--compared", type=int, default=512, help="agents that run on the CPU as well")
 parser.add_argument("--csv", help="a file for the rows")
 options = parser.parse_args()
 
 try:
-    device = open_gpu().device
+    device = look()
 except turgor.InvalidInput as error:
     sys.exit(f"gpu: {error}")
-rows = []
-print(f"{device.name}; million agent-steps/s")
-for body in options.bodies:
-    for kind in KINDS:
-        gpu, cpu, theta = simulators(body, kind, options.steps)
-        same, apart = same_bits(gpu, cpu, theta(options.compared))
-        print(f"{body}, {kind}: {options.compared} agents end", "at the CPU's bits" if same else f"{apart:.3g} m apart")
-        for batch in options.batches:
-            kernel, call, seconds = fastest(gpu, device, theta(batch), options.repeats)
-            print(f"{batch:>9} agents  kernel {kernel:8.2f}  call {call:8.2f}  {seconds:7.2f} s", flush=True)
-            today = f"{datetime.now(UTC):%Y-%m-%d}"
-            numbers = [f"{number:.4g}" for number in (kernel, call, seconds)]
-            rows.append([device.name, today, turgor.__version__, body, kind, batch, *numbers, same])
+failed = subprocess.run([sys.executable, "-m", "pytest", "-q", "-rs", str(TESTS)]).returncode
+rows = list(measure(device, options))
 if options.csv:
     with open(options.csv, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([COLUMNS, *rows])
+sys.exit(1 if failed else 0)

@@ -350,7 +350,6 @@ class Driver:
 
     def __init__(self, memory: int = 2**30) -> None:
         self.memory = memory  # [byte], that it says is free
-        self.launches = 0
         self._rooms: dict[int, np.ndarray] = {}
         for name, kinds in driver.FUNCTIONS.items():
             setattr(self, name, ctypes.CFUNCTYPE(ctypes.c_int, *kinds)(getattr(self, f"_{name}")))
@@ -438,5 +437,4 @@ class Driver:
         assert (function, y, z, below, behind, shared, stream, bool(extra)) == (3, 1, 1, 1, 1, 0, None, False)
         assert threads <= self.kernel.most_threads
         self.kernel.run(ctypes.string_at(arguments[0], self.kernel.parameter_bytes), blocks, threads)
-        self.launches += 1
         return 0

@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -185,8 +186,11 @@ def test_nvidias_assembler_takes_it(architecture: str, tmp_path: Path) -> None:
     assert int(re.search(r"Used (\d+) registers", done.stderr)[1]) <= 128
 
 
-@pytest.fixture(scope="module")
-def card() -> tuple[ptx.Driver, gpu.Gpu]:
+# --- the PTX, run by a machine on the CPU, and by a GPU where there is one ----------------------------------------
+
+
+@functools.cache
+def machine() -> tuple[ptx.Driver, gpu.Gpu]:
     """The driver of a machine on the CPU that runs the engine's PTX, and the `Gpu` that stands on it."""
     made = ptx.Driver()
     with pytest.MonkeyPatch.context() as patch:
@@ -195,56 +199,131 @@ def card() -> tuple[ptx.Driver, gpu.Gpu]:
 
 
 @pytest.fixture
-def machine(card: tuple[ptx.Driver, gpu.Gpu], monkeypatch: pytest.MonkeyPatch) -> ptx.Driver:
-    """Simulators of device "cuda" run in it."""
-    monkeypatch.setattr(driver, "library", lambda: card[0])
-    monkeypatch.setattr(gpu, "first_gpu", lambda: card[1])
-    return card[0]
+def here(monkeypatch: pytest.MonkeyPatch) -> ptx.Driver:
+    """Simulators of device "cuda" run in the machine, with this driver."""
+    made, found = machine()
+    monkeypatch.setattr(driver, "library", lambda: made)
+    monkeypatch.setattr(gpu, "first_gpu", lambda: found)
+    return made
+
+
+@pytest.fixture(params=["here", "there"])
+def device(request: pytest.FixtureRequest) -> driver.Device:
+    """Where simulators of device "cuda" run: in the machine, or on this computer's GPU."""
+    if request.param == "here":
+        request.getfixturevalue("here")
+    try:
+        return gpu.first_gpu().device
+    except InvalidInput as error:
+        pytest.skip(str(error))
+
+
+def compare(mine: Any, expected: Any, fields: Sequence[str] = FIELDS) -> None:
+    """They are the same, bit by bit."""
+    for field in fields:
+        assert getattr(mine, field).tobytes() == getattr(expected, field).tobytes(), field
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_ptx_has_the_bits_of_the_cpu(machine: ptx.Driver, name: str) -> None:
+def test_rollouts_have_the_bits_of_the_cpu(device: driver.Device, name: str) -> None:
     task = task_of(name, steps=1800 if name in ("hilly", "large") else 400)
-    theta, launches = agents_of(task, 40), machine.launches
-    mine, expected = (Simulator(task, device=device).rollout(theta) for device in ("cuda", "cpu"))
-    assert machine.launches == launches + 1
-    for field in FIELDS:
-        assert getattr(mine, field).tobytes() == getattr(expected, field).tobytes(), field
+    theta, busy = agents_of(task, 40), device.busy
+    compare(Simulator(task, device="cuda").rollout(theta), Simulator(task).rollout(theta))
+    assert device.busy > busy
+
+
+@pytest.mark.parametrize("agents", [1, 31, 33, 127, 129, 300])
+def test_any_number_of_agents(device: driver.Device, agents: int) -> None:
+    """Warps, blocks of memory and of the grid that are not full."""
+    task = task_of("hilly", steps=20)
+    theta = agents_of(task, agents)
+    compare(Simulator(task, device="cuda").rollout(theta), Simulator(task).rollout(theta))
+
+
+def test_agents_may_be_none(device: driver.Device) -> None:
+    task = task_of("hilly")
+    assert len(Simulator(task, device="cuda").rollout(np.zeros((0, task.parameter_count))).fitness) == 0
 
 
 @pytest.mark.parametrize("name", ["escape", "distributed", "inflation"])
-def test_ptx_records_what_the_cpu_does(machine: ptx.Driver, name: str) -> None:
+def test_recordings_have_the_bits_of_the_cpu(device: driver.Device, name: str) -> None:
     task = task_of(name)
-    theta = agents_of(task, 1)[0]
-    mine, expected = (Simulator(task, device=device).record(theta) for device in ("cuda", "cpu"))
-    for field in ("position", "velocity", "pressure", "rest_length", "touch", "observation"):
-        assert getattr(mine, field).tobytes() == getattr(expected, field).tobytes(), field
+    mine, expected = (Simulator(task, device=where).record(agents_of(task, 1)[0]) for where in ("cuda", "cpu"))
+    compare(mine, expected, ("position", "velocity", "pressure", "rest_length", "touch", "observation"))
 
 
-def test_ptx_asks_an_end_of_the_users_own(machine: ptx.Driver) -> None:
+def test_an_end_of_the_users_own_is_asked(device: driver.Device) -> None:
     task = task_of("hilly", steps=120)
     theta = agents_of(task, 12)
     far = np.quantile(np.abs(Simulator(task).rollout(theta).position.mean(axis=1)[:, 0]), 0.8)
     task = msgspec.structs.replace(task, end=lambda position: np.abs(position.mean(axis=1)[:, 0]) > far)
-    mine, expected = (Simulator(task, device=device).rollout(theta) for device in ("cuda", "cpu"))
+    expected = Simulator(task).rollout(theta)
     assert 0 < expected.solved.sum() < 12
-    for field in FIELDS:
-        assert getattr(mine, field).tobytes() == getattr(expected, field).tobytes(), field
+    compare(Simulator(task, device="cuda").rollout(theta), expected)
 
 
-def test_a_batch_larger_than_the_memory_is_cut(machine: ptx.Driver, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_agents_start_where_they_are_put_in_other_tasks_too(device: driver.Device) -> None:
+    tasks = [task_of("hilly", steps=60), task_of("rough", steps=60)]
+    theta = agents_of(tasks[0], 40)
+    simulators = [Simulator(tasks[0], device=where) for where in ("cuda", "cpu")]
+    for mine, expected in zip(*(simulator.rollout_in(tasks, theta) for simulator in simulators), strict=True):
+        compare(mine, expected)
+    starts = tasks[0].position + np.linspace(0, 1, 40)[:, None, None]
+    compare(*(simulator.rollout(theta, starts) for simulator in simulators))
+
+
+def test_a_batch_larger_than_the_memory_is_cut(device: driver.Device, monkeypatch: pytest.MonkeyPatch) -> None:
     task = task_of("hilly", steps=30)
-    theta, whole = agents_of(task, 100), Simulator(task, device="cuda")
+    theta, whole, launches = agents_of(task, 100), Simulator(task, device="cuda"), []
     expected = whole.rollout(theta)
-    monkeypatch.setattr(machine, "memory", 1_000_000)
+    launch = device.launch
+    monkeypatch.setattr(device, "free_bytes", lambda: 1_000_000)
+    monkeypatch.setattr(device, "launch", lambda *given: launches.append(given) or launch(*given))
     at_once = whole._gpu.agents_at_once(whole._world)
     assert ON_GPU.abreast <= at_once < 100
-    launches = machine.launches
-    assert whole.rollout(theta).position.tobytes() == expected.position.tobytes()
-    assert machine.launches - launches == -(-100 // at_once)
+    compare(whole.rollout(theta), expected)
+    assert len(launches) == -(-100 // at_once)
 
 
-def test_a_gpu_runs_whole_tasks(machine: ptx.Driver) -> None:
+def test_other_threads_may_call(device: driver.Device) -> None:
+    """CUDA's calls are for the device of their thread."""
+    task = task_of("hilly", steps=20)
+    theta, simulator = agents_of(task, 40), Simulator(task, device="cuda")
+    with ThreadPoolExecutor(1) as pool:
+        compare(pool.submit(simulator.rollout, theta).result(), Simulator(task).rollout(theta))
+
+
+def test_what_is_too_much_for_the_memory_is_told_in_one_line(device: driver.Device) -> None:
+    with pytest.raises(InvalidInput, match=r"^device: expected the GPU to do its work; got CUDA_ERROR_OUT_OF_MEMORY$"):
+        device.zeros((2**50,))
+    assert device.zeros((2,)).address > 0  # and it goes on
+
+
+def test_code_that_is_refused_is_told_in_one_line(device: driver.Device) -> None:
+    other = driver.Device()
+    with pytest.raises(
+        InvalidInput, match=r"^device: expected a GPU that can run the engine; got CUDA_ERROR_"
+    ) as error:
+        other.load(b"nothing", "nothing")
+    assert "\n" not in str(error.value)
+
+
+def test_65536_agents_on_a_gpu() -> None:
+    """Those that are looked at have the bits of the CPU, and all together its distribution."""
+    if not has_gpu():
+        pytest.skip("needs a GPU")
+    task = task_of("large", steps=200)
+    theta = np.random.default_rng(0).uniform(-1, 1, (65_536, task.parameter_count)).astype(np.float32)
+    mine = Simulator(task, device="cuda").rollout(theta)
+    looked_at = np.random.default_rng(1).integers(0, 65_536, 2000)
+    expected = Simulator(task).rollout(theta[looked_at])
+    assert mine.position[looked_at].tobytes() == expected.position.tobytes()
+    np.testing.assert_allclose(
+        np.quantile(mine.fitness, [0.1, 0.5, 0.9]), np.quantile(expected.fitness, [0.1, 0.5, 0.9]), atol=0.1
+    )
+
+
+def test_a_gpu_runs_whole_tasks(here: ptx.Driver) -> None:
     simulator = Simulator(task_of("hilly"), device="cuda")
     with pytest.raises(InvalidInput, match="reset: expected a simulator of device 'cpu': a GPU runs whole tasks"):
         simulator.reset(4)
@@ -253,9 +332,15 @@ def test_a_gpu_runs_whole_tasks(machine: ptx.Driver) -> None:
     assert repr(simulator).endswith("device='cuda')")
 
 
-def test_agents_on_a_gpu_may_be_none(machine: ptx.Driver) -> None:
-    task = task_of("hilly")
-    assert len(Simulator(task, device="cuda").rollout(np.zeros((0, task.parameter_count))).fitness) == 0
+def test_what_the_assembler_says_is_told(here: ptx.Driver) -> None:
+    with pytest.raises(InvalidInput, match=r"; got CUDA_ERROR_INVALID_PTX line 1: no entry$"):
+        driver.Device().load(b"nothing", "nothing")
+
+
+def test_memory_is_given_back(here: ptx.Driver) -> None:
+    simulator = Simulator(task_of("hilly", steps=2), device="cuda")
+    simulator.rollout(agents_of(simulator.task, 40))
+    assert here.used == 0
 
 
 # --- the machine itself -------------------------------------------------------------------------------------------
@@ -310,7 +395,7 @@ def test_the_machine_refuses_what_is_not_exact(operation: str) -> None:
         ptx.Kernel(PROGRAM.replace("OPERATION", operation))
 
 
-# --- without a GPU, and on one ------------------------------------------------------------------------------------
+# --- without a GPU ------------------------------------------------------------------------------------------------
 
 
 def test_without_a_gpu_the_error_is_one_line() -> None:
@@ -321,27 +406,6 @@ def test_without_a_gpu_the_error_is_one_line() -> None:
     ) as error:
         Simulator(task_of("hilly"), device="cuda")
     assert "\n" not in str(error.value)
-
-
-def test_a_gpu_that_is_full_is_told_in_one_line(machine: ptx.Driver, monkeypatch: pytest.MonkeyPatch) -> None:
-    simulator = Simulator(task_of("hilly"), device="cuda")
-    monkeypatch.setattr(machine, "memory", 1000)
-    with pytest.raises(InvalidInput, match=r"^device: expected the GPU to do its work; got CUDA_ERROR_OUT_OF_MEMORY$"):
-        simulator.rollout(agents_of(simulator.task, 40))
-
-
-def test_what_the_assembler_says_is_told_in_one_line(machine: ptx.Driver) -> None:
-    expected = "device: expected a GPU that can run the engine; got CUDA_ERROR_INVALID_PTX line 1: no entry"
-    device = driver.Device()
-    with pytest.raises(InvalidInput, match=f"^{re.escape(expected)}$"):
-        device.load(b"nothing", "nothing")
-
-
-def test_memory_is_given_back(machine: ptx.Driver) -> None:
-    simulator = Simulator(task_of("hilly", steps=2), device="cuda")
-    used = machine.used
-    simulator.rollout(agents_of(simulator.task, 40))
-    assert machine.used == used == 0
 
 
 def test_ptx_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -378,41 +442,3 @@ def has_gpu() -> bool:
         gpu.first_gpu()
         return True
     return False
-
-
-@pytest.fixture(scope="module")
-def real() -> None:
-    """Skips where there is no GPU."""
-    try:
-        gpu.first_gpu()
-    except InvalidInput as error:
-        pytest.skip(str(error))
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_a_gpu_has_the_bits_of_the_cpu(real: None, name: str) -> None:
-    task = task_of(name, steps=1800 if name in ("hilly", "large") else 400)
-    theta = agents_of(task, 300)
-    mine, expected = (Simulator(task, device=device).rollout(theta) for device in ("cuda", "cpu"))
-    for field in FIELDS:
-        assert getattr(mine, field).tobytes() == getattr(expected, field).tobytes(), field
-
-
-def test_a_gpu_records_what_the_cpu_does(real: None) -> None:
-    task = task_of("escape")
-    theta = agents_of(task, 1)[0]
-    mine, expected = (Simulator(task, device=device).record(theta) for device in ("cuda", "cpu"))
-    assert mine.position.tobytes() == expected.position.tobytes()
-
-
-def test_a_gpu_runs_65536_agents(real: None) -> None:
-    """Those that are looked at have the bits of the CPU, and all together its distribution."""
-    task = task_of("large", steps=200)
-    theta = np.random.default_rng(0).uniform(-1, 1, (65_536, task.parameter_count)).astype(np.float32)
-    mine = Simulator(task, device="cuda").rollout(theta)
-    looked_at = np.random.default_rng(1).integers(0, 65_536, 2000)
-    expected = Simulator(task).rollout(theta[looked_at])
-    assert mine.position[looked_at].tobytes() == expected.position.tobytes()
-    np.testing.assert_allclose(
-        np.quantile(mine.fitness, [0.1, 0.5, 0.9]), np.quantile(expected.fitness, [0.1, 0.5, 0.9]), atol=0.1
-    )

@@ -21,6 +21,7 @@ from numba.core.cpu import _dynfunc
 from numba.np.arrayobj import populate_array
 from numba.np.numpy_support import from_dtype
 
+from turgor.errors import InvalidInput
 from turgor.physics.engine import ENTRY, THREADS, target_machine, words_in
 
 WORD = ir.IntType(64)
@@ -199,14 +200,16 @@ def _entry(part: Any, arguments: Sequence[Any], on_gpu: bool) -> ir.Module:
     """The function ENTRY."""
     context, description = part.target_context, part.fndesc
     module = context.codegen()._create_empty_module(ENTRY)
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [WORD.as_pointer()]), ENTRY)
+    argument_type = ir.ArrayType(WORD, 0) if on_gpu else WORD
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [argument_type.as_pointer()]), ENTRY)
     builder = ir.IRBuilder(function.append_basic_block())
+    words = builder.bitcast(function.args[0], WORD.as_pointer())
     taken = 0
 
     def take(count: int = 1) -> ir.Value:
         nonlocal taken
         taken += count
-        return builder.gep(function.args[0], [WORD(taken - count)])
+        return builder.gep(words, [WORD(taken - count)])
 
     values = []
     for argument in arguments:
@@ -250,8 +253,9 @@ def _array(context: Any, builder: Any, kind: Any, shape: Any, take: Callable[...
 
 
 def ptx(kernel: Any, arguments: Sequence[Any], architecture: str = OLDEST_GPU) -> str:
-    """The same for NVIDIA GPUs of an `architecture` or newer, as text that their driver makes machine code of. The
-    words themselves are what the kernel is launched with; a THREAD is the thread's number."""
+    """The same as `machine_code` for NVIDIA GPUs of an `architecture` or newer: text that their driver makes machine
+    code of. The words themselves are what the kernel is launched with; a THREAD is the thread's number. Raises
+    `InvalidInput` where llvmlite was built without such GPUs."""
     machine = _gpu_machine(architecture)
     return machine.emit_assembly(optimised(kernel, arguments, machine))
 
@@ -260,7 +264,11 @@ def _gpu_machine(architecture: str) -> Any:
     """LLVM's description of a GPU. Every operation is rounded as IEEE 754 has it, one by one, as by default."""
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    return llvm.Target.from_triple(GPU).create_target_machine(cpu=architecture, opt=3)
+    try:
+        target = llvm.Target.from_triple(GPU)
+    except RuntimeError as error:
+        raise InvalidInput("device: expected an llvmlite that knows NVIDIA's GPUs, as on PyPI", str(error)) from None
+    return target.create_target_machine(cpu=architecture, opt=3)
 
 
 def _make_gpu_kernel(function: ir.Function, words: int) -> None:
