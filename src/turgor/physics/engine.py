@@ -50,8 +50,7 @@ PASSING = {  # ... those of one call ...
     "stands": (np.float32, 2),
 }
 COUNTS = ("drive", "first_step", "steps", "last_step")  # ... and whole numbers
-
-WORD = 8  # [byte]
+WORD_BYTES = 8  # of an address or a whole number
 
 _sources = Path(__file__).parent
 _loading = threading.Lock()
@@ -70,12 +69,12 @@ def words_of(arrays: Iterable[np.ndarray], kinds: Mapping[str, tuple[type, int]]
 
 def in_words(array: np.ndarray) -> bytes:
     """An array that lies among the words."""
-    return array.tobytes().ljust(WORD * words_in(array.shape, array.itemsize), b"\0")
+    return array.tobytes().ljust(WORD_BYTES * words_in(array.shape, array.itemsize), b"\0")
 
 
 def words_in(shape: Sequence[int], size: int) -> int:
     """The words that an array of numbers of `size` bytes takes, where it lies among them."""
-    return -(-math.prod(shape) * size // WORD)
+    return -(-math.prod(shape) * size // WORD_BYTES)
 
 
 def run_blocks(words: Sequence[int]) -> None:
