@@ -16,7 +16,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from turgor.bench.parts import PARTS, QUICK, Plan, Skipped
+from turgor.bench.measuring import QUICK, Plan, Skipped
+from turgor.bench.parts import PARTS
 from turgor.bench.report import (
     Row,
     as_csv,

@@ -27,6 +27,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     controllers: str = ""
     batch: int | None = None  # agents at once
     threads: int | None = None
+    size: int | None = None  # masses of the body, or segments of the terrain, where that is what varies
     value: float
     unit: str
     what: str
@@ -102,7 +103,7 @@ def show_comparison(rows: Sequence[Row], before: Record, here: dict[str, str]) -
     title = f"against {before.facts.get('date', '?')}, turgor {before.facts.get('turgor', '?')}"
     if before.facts.get("machine") != here["machine"]:
         title += f"; ANOTHER MACHINE: {before.facts.get('cpu') or before.facts.get('machine', '?')}"
-    names = ("name", "body", "task", "controllers", "batch", "threads", "unit", "before", "now", "now / before")
+    names = ("name", "body", "task", "controllers", "batch", "threads", "size", "unit", "before", "now", "now / before")
     lines = [
         ["" if cell is None else str(cell) for cell in (*identity(now), now.unit)]
         + [f"{was.value:.4g}", f"{now.value:.4g}", f"{now.value / was.value:.3f}" if was.value else ""]
@@ -114,7 +115,7 @@ def show_comparison(rows: Sequence[Row], before: Record, here: dict[str, str]) -
 
 def identity(row: Row) -> tuple[str | int | None, ...]:
     """What a row is a figure of."""
-    return row.name, row.body, row.task, row.controllers, row.batch, row.threads
+    return row.name, row.body, row.task, row.controllers, row.batch, row.threads, row.size
 
 
 def show_table(title: str, names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
@@ -125,7 +126,7 @@ def show_table(title: str, names: Sequence[str], lines: Sequence[Sequence[str]])
 
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
         for name in names:
-            right = name in ("batch", "threads", "value", "before", "now", "now / before")
+            right = name in ("batch", "threads", "size", "value", "before", "now", "now / before")
             table.add_column(name, justify="right" if right else "left", no_wrap=name != "what")
         for line in lines:
             table.add_row(*line)
@@ -162,7 +163,7 @@ def read_record(path: Path) -> Record:
         else:
             rows = list(csv.DictReader(io.StringIO(text)))
             facts = {name: value for name, value in rows[0].items() if name not in Row.__struct_fields__}
-            rows = [{name: line[name] for name in Row.__struct_fields__ if line[name] != ""} for line in rows]
+            rows = [{name: line[name] for name in Row.__struct_fields__ if line.get(name)} for line in rows]
         return Record(facts=facts, rows=msgspec.convert(rows, list[Row], strict=False))
     except OSError as error:
         raise InvalidInput(f"{path}: expected a file of an earlier run", error.strerror) from None
