@@ -23,7 +23,7 @@ from turgor.bench.measuring import (
     usable_threads,
     warm_up,
 )
-from turgor.bench.report import Row, say
+from turgor.bench.report import PEERS, Row, ratio_name, say
 from turgor.bench.scaling import scaling
 
 PEER = Path(__file__).parents[3] / "benchmarks" / "box2d_peer.py"  # not part of the installed package
@@ -272,16 +272,12 @@ def peer_rows(plan: Plan, box2d_peer: Any, body: str, kind: str) -> Iterator[Row
         yield Row(name=f"peer.{name}", **same, batch=batch, value=rate, unit="M agent-steps/s", what=what)
     for k, name in enumerate(others):
         for batch, rate in zip((1, len(many)), rates[-2:], strict=True):
-            ratio = "peer.ratio" if name == "box2d" else f"peer.ratio.{name}"
             what = f"the engine against {PEERS[name]}, measured in turn"
-            yield Row(name=ratio, **same, batch=batch, value=rate / rates[k], unit="times", what=what)
+            yield Row(name=ratio_name(name), **same, batch=batch, value=rate / rates[k], unit="times", what=what)
     together = min(30, plan.steps)
     there, here = box2d_peer.trajectory(task, few[0], together), simulator.record(few[0]).position[: together + 1]
     what = f"largest difference of a coordinate between pybox2d and the engine in the first {together} steps"
     yield Row(name="peer.difference", **same, batch=1, value=float(abs(there - here).max()), unit="m", what=what)
-
-
-PEERS = {"box2d": "pybox2d", "box2d-v3": "Box2D v3"}
 
 
 def peers(box2d_peer: Any) -> dict[str, Any]:
