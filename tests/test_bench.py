@@ -33,6 +33,7 @@ TINY = bench.Plan(
     curve_agents=3,
     curve_crowd=40,
     curve_steps=20,
+    curve_seconds=0.0,
     environment_bodies=("small",),
     environments=(5,),
     memory_body="small",

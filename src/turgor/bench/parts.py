@@ -81,7 +81,7 @@ def environment_rows(plan: Plan, body: str, agents: int, threads: list[int]) -> 
     actions = actions_of(envs[-1], task, theta)
     calls: list[Callable[[], object]] = [partial(play, each, actions) for each in envs]
     calls += [partial(Simulator(task, threads=t).rollout, theta) for t in threads]
-    times = fastest(calls, plan.seconds, plan.repeats)
+    times = fastest(calls, plan.curve_seconds, plan.repeats)
     same: dict[str, Any] = {"body": body, "task": "hilly", "controllers": kind, "batch": agents}
     for t, stepped, rolled in zip(threads, times, times[len(threads) :], strict=False):
         rates = [agents * plan.steps / took / MILLION for took in (stepped, rolled)]

@@ -40,7 +40,7 @@ def over_batches(plan: Plan) -> Iterator[Row]:
         simulators = [Simulator(task, threads=t) for t in threads]
         for batch in plan.curve_batches:
             theta = controllers("inflated", task, batch, plan.generations)
-            times = fastest([partial(s.rollout, theta) for s in simulators], plan.seconds, plan.repeats)
+            times = fastest([partial(s.rollout, theta) for s in simulators], plan.curve_seconds, plan.repeats)
             for t, took in zip(threads, times, strict=True):
                 yield Row(
                     name="scaling.batch",
@@ -79,7 +79,7 @@ def over_masses(plan: Plan) -> Iterator[Row]:
             calls.append(
                 partial(Simulator(ring_task(masses, shape, plan.curve_steps), threads=1).rollout, theta, starts)
             )
-        times = fastest(calls, plan.seconds, plan.repeats)
+        times = fastest(calls, plan.curve_seconds, plan.repeats)
         for shape, end, took in zip(SHAPES, ends, times, strict=True):
             yield Row(
                 name="scaling.masses",
@@ -123,7 +123,7 @@ def told_of(task: Task, position: Any) -> str:
 
 def over_segments(plan: Plan) -> Iterator[Row]:
     """Rows: the terrain's segments, all numbers in turn; and what a step costs on the longest against the shortest."""
-    times = segment_times(plan.curve_segments, plan.curve_agents, plan.curve_steps, plan.seconds, plan.repeats)
+    times = segment_times(plan.curve_segments, plan.curve_agents, plan.curve_steps, plan.curve_seconds, plan.repeats)
     same: dict[str, Any] = {
         "body": "small",
         "task": "hilly",
@@ -188,7 +188,7 @@ def over_threads(plan: Plan) -> Iterator[Row]:
         task = make_task("hilly", body, plan.curve_steps, "inflated")
         theta = controllers("inflated", task, plan.curve_crowd, plan.generations)
         calls = [partial(Simulator(task, threads=t).rollout, theta) for t in threads]
-        for t, took in zip(threads, fastest(calls, plan.seconds, plan.repeats), strict=True):
+        for t, took in zip(threads, fastest(calls, plan.curve_seconds, plan.repeats), strict=True):
             yield Row(
                 name="scaling.threads",
                 body=body,
