@@ -91,18 +91,20 @@ def draw_segments(rows: Sequence[Row], axes: Any) -> None:
 
 
 def draw_threads(rows: Sequence[Row], axes: Any) -> None:
-    """Speed over threads, beside what as many times the first one's would be."""
+    """How many times as fast more threads are, a line a body; dotted: as many times as there are threads."""
     counts = sorted({row.threads or 1 for row in rows})
     for body in dict.fromkeys(row.body for row in rows):
         mine, look = rows_of(rows, "scaling.threads", body=body), SIZES[body]
         how: dict[str, Any] = {"color": look.colour, "linestyle": look.line, "marker": look.marker, "markersize": 4}
-        axes.plot([row.threads for row in mine], [row.value for row in mine], label=body, **how)
-        axes.plot(counts, [mine[0].value * count for count in counts], ":", color=GREY, linewidth=0.9, zorder=0)
-    axes.plot([], [], ":", color=GREY, linewidth=0.9, label="as many times one thread")
+        axes.plot([row.threads for row in mine], [row.value / mine[0].value for row in mine], label=body, **how)
+    axes.plot(counts, counts, ":", color=GREY, linewidth=0.9, zorder=0, label="as many times as threads")
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log", base=2)
     axes.set_xticks(counts, [str(count) for count in counts])
-    axes.set_ylim(0, None)
-    label_axes(axes, "d  threads", "threads", RATE)
-    axes.legend(loc="upper left", handlelength=3)
+    axes.set_yticks(counts, [str(count) for count in counts])
+    axes.set_ylim(0.6, None)  # room for the legend
+    label_axes(axes, "d  threads", "threads", "times as fast as one thread")
+    axes.legend(loc="lower right", handlelength=3)
 
 
 def draw_evolution(rows: Sequence[Row], path: Path) -> None:
