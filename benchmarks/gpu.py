@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import turgor
-from turgor.bench.parts import controllers, make_task
+from turgor.bench.measuring import controllers, make_task
 from turgor.physics.driver import Device
 from turgor.physics.engine import ENTRY, PTX, code_of
 from turgor.physics.gpu import first_gpu
