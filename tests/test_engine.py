@@ -116,7 +116,7 @@ def test_the_file_of_older_sources_goes(monkeypatch: pytest.MonkeyPatch, tmp_pat
     names = {"kernel-here-old", "kernel-here-new", "kernel-elsewhere-old"}
     for name in sorted(names - {"kernel-here-new"}):
         (tmp_path / name).touch()
-    monkeypatch.setattr(engine, "_name", lambda: "kernel-here-new")
+    monkeypatch.setattr(engine, "_name", lambda kind: "kernel-here-new")
     engine._keep(b"machine code")
     assert {path.name for path in tmp_path.iterdir()} == names - {"kernel-here-old"}
 
