@@ -23,6 +23,8 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
+from turgor.errors import InvalidInput, describe
+
 ENTRY = "turgor_run_blocks"
 DIGEST = 32  # [byte], the checksum before the machine code
 # The arguments of `step.run_blocks`: arrays in C order, type and dimensions of each. Those of a batch ...
@@ -73,7 +75,8 @@ _WORDS = struct.Struct(f"{sum(1 + n for _, n in (LASTING | PASSING).values()) + 
 
 
 def load(before_making: Callable[[], object] = lambda: None) -> None:
-    """Has the machine code in memory; calls `before_making` if it has to be made."""
+    """Has the machine code in memory; calls `before_making` if it has to be made. Raises `InvalidInput` where the
+    installed Numba cannot make it."""
     with _loading:
         if _loaded:
             return
@@ -97,9 +100,25 @@ def _made() -> bytes:
         from turgor.physics.step import ARGUMENTS, run_blocks
 
         return machine_code(run_blocks, ARGUMENTS)
+    except Exception as error:
+        _blame_numba(error)
+        raise
     finally:
         if collecting:
             gc.enable()
+
+
+def _blame_numba(error: Exception) -> None:
+    """Raises `InvalidInput` where Numba cannot be imported, or is none of those that turgor allows."""
+    from importlib import metadata
+
+    from packaging.requirements import Requirement
+
+    allowed = next(r for r in map(Requirement, metadata.requires("turgor") or ()) if r.name == "numba")
+    found = metadata.version("numba")
+    if isinstance(error, ImportError) or found not in allowed.specifier:
+        expected = f"expected {allowed} to make the engine with ('pip check' lists what does not fit)"
+        raise InvalidInput(expected, f"numba {found}: {describe(error)}") from error
 
 
 # --- the processor ------------------------------------------------------------------------------------------------
@@ -107,7 +126,8 @@ def _made() -> bytes:
 
 def processor() -> tuple[str, str]:
     """This processor's name and features as LLVM knows them, or those in NUMBA_CPU_NAME and NUMBA_CPU_FEATURES."""
-    name, features = os.environ.get("NUMBA_CPU_NAME"), os.environ.get("NUMBA_CPU_FEATURES")
+    name = os.environ.get("NUMBA_CPU_NAME")
+    features = os.environ.get("NUMBA_CPU_FEATURES", "" if name == "generic" else None)
     if features is None:
         try:
             features = llvm.get_host_cpu_features().flatten()
@@ -169,7 +189,12 @@ def _keep(code: bytes) -> None:
         with contextlib.suppress(OSError, NotWritten):
             folder.mkdir(parents=True, exist_ok=True)
             write_whole(folder / _name(), hashlib.sha256(code).digest() + code)
-            for file in folder.glob(f"{_name().rpartition('-')[0]}-*"):
-                if file.name != _name():
-                    file.unlink(missing_ok=True)
+            _remove_older(folder)
             return
+
+
+def _remove_older(folder: Path) -> None:
+    for file in folder.glob(f"{_name().rpartition('-')[0]}-*"):
+        if file.name != _name():
+            with contextlib.suppress(OSError):  # Windows keeps a file that another process reads
+                file.unlink()
