@@ -25,6 +25,8 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
+from turgor.errors import InvalidInput, describe
+
 ENTRY = "turgor_run_blocks"
 KERNEL, PTX = "kernel", "ptx"  # what a file holds: machine code for this processor, or what is made for GPUs
 THREADS = 128  # of a block of a GPU's grid
@@ -88,7 +90,8 @@ _WORDS = struct.Struct(f"{sum(1 + n for _, n in (LASTING | PASSING).values()) + 
 
 
 def load(before_making: Callable[[], object] = lambda: None) -> None:
-    """Has the machine code in memory; calls `before_making` if it has to be made."""
+    """Has the machine code in memory; calls `before_making` if it has to be made. Raises `InvalidInput` where the
+    installed Numba cannot make it."""
     with _loading:
         if _loaded:
             return
@@ -122,9 +125,29 @@ def _made(kind: str = KERNEL) -> bytes:
         if kind == PTX:
             return build.ptx(step.run_agent, step.THREAD_ARGUMENTS).encode()
         return build.machine_code(step.run_blocks, step.ARGUMENTS)
+    except Exception as error:
+        _blame_numba(error)
+        raise
     finally:
         if collecting:
             gc.enable()
+
+
+def _blame_numba(error: Exception) -> None:
+    """Raises `InvalidInput` where Numba cannot be imported, or is none of those that turgor allows."""
+    from importlib import metadata
+
+    from packaging.requirements import Requirement
+
+    try:
+        required = metadata.requires("turgor") or ()
+    except metadata.PackageNotFoundError:  # sources that are not installed: nobody has said what they need
+        return
+    allowed = next(r for r in map(Requirement, required) if r.name == "numba")
+    found = metadata.version("numba")
+    if isinstance(error, ImportError) or found not in allowed.specifier:
+        expected = f"expected {allowed} to make the engine with ('pip check' lists what does not fit)"
+        raise InvalidInput(expected, f"numba {found}: {describe(error)}") from error
 
 
 # --- the processor ------------------------------------------------------------------------------------------------
@@ -132,7 +155,8 @@ def _made(kind: str = KERNEL) -> bytes:
 
 def processor() -> tuple[str, str]:
     """This processor's name and features as LLVM knows them, or those in NUMBA_CPU_NAME and NUMBA_CPU_FEATURES."""
-    name, features = os.environ.get("NUMBA_CPU_NAME"), os.environ.get("NUMBA_CPU_FEATURES")
+    name = os.environ.get("NUMBA_CPU_NAME")
+    features = os.environ.get("NUMBA_CPU_FEATURES", "" if name == "generic" else None)
     if features is None:
         try:
             features = llvm.get_host_cpu_features().flatten()
@@ -195,7 +219,12 @@ def _keep(code: bytes, kind: str = KERNEL) -> None:
         with contextlib.suppress(OSError, NotWritten):
             folder.mkdir(parents=True, exist_ok=True)
             write_whole(folder / name, hashlib.sha256(code).digest() + code)
-            for file in folder.glob(f"{name.rpartition('-')[0]}-*"):
-                if file.name != name:
-                    file.unlink(missing_ok=True)
+            _remove_older(folder, name)
             return
+
+
+def _remove_older(folder: Path, name: str) -> None:
+    for file in folder.glob(f"{name.rpartition('-')[0]}-*"):
+        if file.name != name:
+            with contextlib.suppress(OSError):  # Windows keeps a file that another process reads
+                file.unlink()

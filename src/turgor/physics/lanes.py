@@ -166,6 +166,8 @@ for _prefix in ("", "i"):
     _define(getattr(operator, _prefix + "or" + "_" * (not _prefix)), ("mask",), lambda b, lanes, x, y: b.or_(x, y))
 _define(operator.invert, ("mask",), lambda builder, lanes, a: builder.not_(a), arguments=1)
 # As the vector units do it: the second operand where the comparison does not hold, NaN included.
+# On ARM64 LLVM takes FMINNM for min(x, 0.0), which gives -0.0 for -0.0. Only the solver's `correction` has such a
+# minimum, and there the sign of 0 is lost in the next sum.
 _define(min, ("float",), lambda b, lanes, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
 _define(max, ("float",), lambda b, lanes, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))
 _define(abs, ("float",), _llvm_function("fabs"), arguments=1)
