@@ -120,11 +120,12 @@ def _made(kind: str = KERNEL) -> bytes:
     collecting = gc.isenabled()
     gc.disable()  # Numba makes millions of objects that it keeps
     try:
-        from turgor.physics import build, step
+        from turgor.physics.build import machine_code, ptx
+        from turgor.physics.step import ARGUMENTS, THREAD_ARGUMENTS, run_agent, run_blocks
 
         if kind == PTX:
-            return build.ptx(step.run_agent, step.THREAD_ARGUMENTS).encode()
-        return build.machine_code(step.run_blocks, step.ARGUMENTS)
+            return ptx(run_agent, THREAD_ARGUMENTS).encode()
+        return machine_code(run_blocks, ARGUMENTS)
     except Exception as error:
         _blame_numba(error)
         raise
