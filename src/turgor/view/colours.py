@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,7 @@ def ycbcr(colour: Colour) -> Colour:
     return (round(128 + cr * 224 / 255), round(16 + luma * 219 / 255), round(128 + cb * 224 / 255), *alpha)
 
 
+@functools.cache
 def premultiplied(colour: Colour) -> Colour:
     """The colour times its alpha, if it has one: what an average over a transparent ground is made of."""
     parts, alpha = colour[:3], colour[3:]
@@ -49,7 +50,8 @@ def put_planes(surface: pygame.Surface, luma: np.ndarray, cb: np.ndarray, cr: np
     `luma` is uint8 [height, width]; `cb` and `cr` uint8 [height / 2, width / 2] take the mean of 2 x 2 pixels each.
     """
     width, height = surface.get_size()
-    pixels = np.frombuffer(surface.get_buffer(), np.uint32).reshape(height, width)  # 0x00RRGGBB
+    buffer: Any = surface.get_buffer()
+    pixels = np.frombuffer(buffer, np.uint32).reshape(height, width)  # 0x00RRGGBB
     np.copyto(luma, pixels >> 8, casting="unsafe")  # the low byte
     # red and blue, with room for sums between them; two pixels of a line in each number
     pair = (pixels[::2] & 0x00FF00FF).view(np.uint64)

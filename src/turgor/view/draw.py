@@ -6,7 +6,6 @@ and masses. The camera turns metres into pixels; text and colour bars are laid o
 
 from __future__ import annotations
 
-import math
 import os
 from typing import TYPE_CHECKING, Any
 

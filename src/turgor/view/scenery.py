@@ -10,7 +10,7 @@ import numpy as np
 
 from turgor.scene import Scene, highest_ground
 from turgor.view.camera import SUBPIXELS, Camera
-from turgor.view.colours import Colour, Colours, premultiplied
+from turgor.view.colours import Colours, premultiplied
 from turgor.view.shapes import SURFACE, Shape, ground_shapes, visible_ground, wall_shapes
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class Scenery:
         origin, width = self.camera.origin(step)[0], self.camera.size[0]
         spacing = SUBPIXELS * self.camera.scale * self.camera.spacing
         for k in range(math.ceil(-origin / spacing), math.floor((SUBPIXELS * width - origin) / spacing) + 1):
-            x, part = divmod(round(origin + k * spacing - 0.5 * SUBPIXELS), SUBPIXELS)
+            x, part = divmod(math.floor(origin + k * spacing - 0.5 * SUBPIXELS + 0.5), SUBPIXELS)  # never half to even
             yield self._grid[part], (x, 0)
 
 
@@ -124,13 +124,14 @@ class Tile:
         self._corner = SUBPIXELS * np.array(place) * TILE - (SUBPIXELS - 1)
         self._canvas = pygame.Surface(extent.tolist(), pygame.SRCALPHA, 32)
         unit = SUBPIXELS * scenery.camera.scale  # [px / SUBPIXELS / m]
-        (left, top), (right, bottom) = self._corner / unit, (self._corner + extent) / unit
+        (left, _), (right, bottom) = self._corner / unit, (self._corner + extent) / unit
         for colour, corners in scenery.shapes(left, right, -bottom):
             points = corners * (unit, -unit) - self._corner
             if (points.max(axis=0) >= 0).all() and (points.min(axis=0) <= extent).all():
                 pygame.draw.polygon(self._canvas, scenery.colours(colour), points.tolist())
         self._labels = list(self._draw_ruler(scenery))
-        pixels = np.frombuffer(self._canvas.get_buffer(), np.uint32)
+        buffer: Any = self._canvas.get_buffer()
+        pixels = np.frombuffer(buffer, np.uint32)
         self.mixed = bool(self._labels) or bool((pixels != pixels[0]).any())
         self.colour = tuple(self._canvas.get_at((0, 0)))  # where it is not mixed; transparent: nothing there
 
