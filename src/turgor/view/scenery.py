@@ -134,6 +134,8 @@ class Tile:
         pixels = np.frombuffer(buffer, np.uint32)
         self.mixed = bool(self._labels) or bool((pixels != pixels[0]).any())
         self.colour = tuple(self._canvas.get_at((0, 0)))  # where it is not mixed; transparent: nothing there
+        if not self.mixed:
+            del self._canvas  # of no more use, and half a megabyte
 
     def look(self, across: int, down: int) -> pygame.Surface:
         """The picture, colours times alpha, where the world lies that far right and down [px / SUBPIXELS]."""
