@@ -6,7 +6,7 @@ It is what a careful author would write without an engine of their own: everythi
 once, positions and velocities are read through live views of Box2D's vectors, one force per mass, one NumPy product
 for the controller, a contact listener instead of lists of contacts. The world is that of `turgor.fidelity.box2d`, which
 runs any task; what is here does one kind of task, and that faster. `turgor bench` runs it beside the engine, and the
-tests hold the two together over the first steps. Needs the package `box2d`.
+tests hold the two together over the first steps. Needs the package `box2d`; with `pyb2d3` the same runs in Box2D v3.
 """
 
 from __future__ import annotations
@@ -28,9 +28,7 @@ class Agent:
         check_task(task)
         body, n = task.body, task.body.mass_count
         self.physics = task.physics
-        self.box2d = Box2DWorld(task, task.position)
-        self.world, self.masses, self.springs = self.box2d.world, self.box2d.masses, self.box2d.springs
-        self.position, self.velocity, self.touches = self.box2d.positions, self.box2d.velocities, self.box2d.touches
+        self.lay_out(task)
         self.share = body.mass / body.mass.sum()
 
         # observations: touch, x of all, y of all, velocity, pressure; theta has x and y of each mass together
@@ -55,27 +53,30 @@ class Agent:
         self.pressure_min, self.pressure_max = task.pressure_range[0].tolist()
         self.pressure_step = float(task.pressure_step[0])
 
+    def lay_out(self, task: Task) -> None:
+        """Makes the world."""
+        self.box2d = Box2DWorld(task, task.position)
+        self.world, self.masses, self.springs = self.box2d.world, self.box2d.masses, self.box2d.springs
+        self.touch = self.box2d.touches.count  # live, as positions and velocities are
+
     def step(self) -> None:
         """Sense, control, actuate, push, solve."""
         state = self.read()
         output = self.weight @ self.sense(state) + self.bias
-        self.actuate(output)
-        self.push(state[:2])
-        self.world.Step(self.physics.dt, self.physics.velocity_iterations, self.physics.position_iterations)
-        self.world.ClearForces()
+        self.advance(self.actuate(output), self.push(state[:2]))
         self.steps += 1
 
     def read(self) -> np.ndarray:
         """x, y [m] and velocity x, y [m/s] of all masses, shape [4, mass]."""
-        p, v = self.position, self.velocity
+        p, v = self.box2d.positions, self.box2d.velocities
         return np.array([[a.x for a in p], [a.y for a in p], [a.x for a in v], [a.y for a in v]])
 
     def sense(self, state: np.ndarray) -> np.ndarray:
         """The mean of the last observations, as many as the window holds."""
-        n, observation = len(self.masses), self.window[self.steps % len(self.window)]
+        n, observation = len(self.share), self.window[self.steps % len(self.window)]
         self.total -= observation
         centre = state @ self.share
-        observation[:n] = self.touches.count
+        observation[:n] = self.touch
         observation[n : 3 * n] = ((state[:2] - centre[:2, None]) / self.position_scale).ravel()
         observation[3 * n : 3 * n + 2] = centre[2:] / self.velocity_scale
         observation[-1] = self.pressure / self.pressure_max
@@ -83,23 +84,46 @@ class Agent:
         self.total += observation
         return self.total / min(self.steps + 1, len(self.window))
 
-    def actuate(self, output: np.ndarray) -> None:
-        """Sets rest lengths and pressure."""
+    def actuate(self, output: np.ndarray) -> np.ndarray:
+        """Rest lengths [m], shape [spring]; sets the pressure."""
         # L = L0 - s (L0 - l_min) for s > 0, L0 - s (l_max - L0) otherwise;  p = clip(p + dp, p_min, p_max)
         command = np.tanh(output[:-1])
-        lengths = self.rest - command * np.where(command > 0, self.shorten, self.lengthen)
-        for spring, length in zip(self.springs, lengths.tolist(), strict=True):
-            spring.length = length
         pressure = self.pressure + self.pressure_step * float(output[-1])
         self.pressure = min(max(pressure, self.pressure_min), self.pressure_max)
+        return self.rest - command * np.where(command > 0, self.shorten, self.lengthen)
 
-    def push(self, position: np.ndarray) -> None:
-        """Applies the gas's force to every mass."""
+    def push(self, position: np.ndarray) -> np.ndarray:
+        """The gas's force on every mass [N], shape [2, mass]."""
         # its two edges together: p/2 (d_y, -d_x), d from the mass before to the mass after
         d = position.take(self.after, axis=1) - position.take(self.before, axis=1)
-        down, right = (self.pressure / 2 * d).tolist()
-        for mass, fx, fy in zip(self.masses, right, down, strict=True):
-            mass.ApplyForceToCenter((fx, -fy), True)
+        return self.pressure / 2 * np.stack([d[1], -d[0]])
+
+    def advance(self, lengths: np.ndarray, force: np.ndarray) -> None:
+        """One step of the world."""
+        for spring, length in zip(self.springs, lengths.tolist(), strict=True):
+            spring.length = length
+        for mass, fx, fy in zip(self.masses, *force.tolist(), strict=True):
+            mass.ApplyForceToCenter((fx, fy), True)
+        self.world.Step(self.physics.dt, self.physics.velocity_iterations, self.physics.position_iterations)
+        self.world.ClearForces()
+
+
+class AgentV3(Agent):
+    """The same agent in Box2D v3: another solver, so that it moves otherwise. Needs the package `pyb2d3`."""
+
+    def lay_out(self, task: Task) -> None:
+        from turgor.fidelity.box2d_v3 import Box2Dv3World
+
+        n = task.body.mass_count
+        self.box2d = Box2Dv3World(task, task.position)
+        self.position, self.velocity, self.touch = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
+
+    def read(self) -> np.ndarray:
+        self.box2d.read(self.position, self.velocity, self.touch)
+        return np.concatenate([self.position, self.velocity], axis=1).T
+
+    def advance(self, lengths: np.ndarray, force: np.ndarray) -> None:
+        self.box2d.step(lengths, force.T)
 
 
 def check_task(task: Task) -> None:
@@ -112,18 +136,18 @@ def check_task(task: Task) -> None:
         raise ValueError("expected all masses around the chamber, and signed observations")
 
 
-def rollout(task: Task, theta: np.ndarray) -> float:
+def rollout(task: Task, theta: np.ndarray, kind: type[Agent] = Agent) -> float:
     """Mean speed of the centre of mass [m/s] of one agent over the whole task."""
-    agent = Agent(task, theta)
+    agent = kind(task, theta)
     start = agent.read()[0] @ agent.share
     for _ in range(task.steps):
         agent.step()
     return float(agent.read()[0] @ agent.share - start) / task.duration
 
 
-def trajectory(task: Task, theta: np.ndarray, steps: int) -> np.ndarray:
+def trajectory(task: Task, theta: np.ndarray, steps: int, kind: type[Agent] = Agent) -> np.ndarray:
     """Positions [m], shape [step + 1, mass, 2], over the first `steps` steps."""
-    agent = Agent(task, theta)
+    agent = kind(task, theta)
     positions = [agent.read()[:2].T]
     for _ in range(steps):
         agent.step()

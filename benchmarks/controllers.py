@@ -10,7 +10,7 @@ import argparse
 
 import numpy as np
 
-from turgor.bench.parts import fastest
+from turgor.bench.measuring import fastest
 from turgor.control import CONTROLLERS
 from turgor.simulate import Simulator
 from turgor.task import make_task

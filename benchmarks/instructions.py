@@ -33,7 +33,7 @@ TARGET = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": FEATURES}
 # Run under valgrind, which starts to count when it is told to from inside.
 CHILD = """
 import os, subprocess, sys
-from turgor.bench.parts import controllers, make_task
+from turgor.bench.measuring import controllers, make_task
 from turgor.simulate import Simulator
 
 def count(on):

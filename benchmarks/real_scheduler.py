@@ -24,7 +24,7 @@ import numpy as np
 from cluster_model import Load
 from scale_page import find, read_rows
 
-from turgor.bench.parts import Skipped
+from turgor.bench.measuring import Skipped
 from turgor.simulate import available_cores
 
 REPEATS = 2  # of every load

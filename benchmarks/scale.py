@@ -29,7 +29,7 @@ import numpy as np
 import scale_page
 from real_scheduler import scheduler
 
-from turgor.bench.parts import Skipped, fastest, peak_memory
+from turgor.bench.measuring import Skipped, fastest, peak_memory
 from turgor.bench.report import environment, machine_seconds, own_seconds
 from turgor.evolution import STRATEGIES
 from turgor.evolution.loop import evolve

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from turgor import bench
-from turgor.bench import parts
+from turgor.bench import measuring, page, parts, scaling
+from turgor.bench.report import read_record, rows_of
 from turgor.errors import InvalidInput
 from turgor.simulate import Simulator, available_cores
 from turgor.task import make_task
@@ -25,6 +26,16 @@ TINY = bench.Plan(
     seconds=0.0,
     repeats=1,
     generations=2,
+    curve_bodies=("small",),
+    curve_batches=(1, 20),
+    curve_masses=(10, 30),
+    curve_segments=(10, 100),
+    curve_agents=3,
+    curve_crowd=40,
+    curve_steps=20,
+    curve_seconds=0.0,
+    environment_bodies=("small",),
+    environments=(5,),
     memory_body="small",
     memory_agents=30,
     starts=1,
@@ -35,8 +46,10 @@ TINY = bench.Plan(
 )
 COLUMNS = [
     *("machine", "cpu", "date", "turgor", "python", "numba", "other_load"),
-    *("name", "body", "task", "controllers", "batch", "threads", "value", "unit", "what"),
+    *("name", "body", "task", "controllers", "batch", "threads", "size", "value", "unit", "what"),
 ]
+RECORDS = Path(__file__).parents[1] / "benchmarks" / "results"
+DOCS = Path(__file__).parents[1] / "docs"
 
 
 @pytest.fixture(scope="module")
@@ -71,14 +84,14 @@ def test_kernel_has_a_row_for_every_combination() -> None:
 
 @pytest.mark.parametrize("kind", ["random", "inflated", "evolved"])
 def test_controllers_do_not_depend_on_the_batch(kind: str) -> None:
-    task = parts.make_task("hilly", "small", TINY.steps)
-    many = parts.controllers(kind, task, 50, TINY.generations)
+    task = measuring.make_task("hilly", "small", TINY.steps)
+    many = measuring.controllers(kind, task, 50, TINY.generations)
     assert many.shape == (50, task.parameter_count)
     assert len(np.unique(many, axis=0)) == 50
-    few = parts.controllers(kind, task, 3, TINY.generations)
+    few = measuring.controllers(kind, task, 3, TINY.generations)
     np.testing.assert_array_equal(few, many[:3])
-    parts.evolved.cache_clear()
-    np.testing.assert_array_equal(parts.controllers(kind, task, 50, TINY.generations), many)
+    measuring.evolved.cache_clear()
+    np.testing.assert_array_equal(measuring.controllers(kind, task, 50, TINY.generations), many)
 
 
 def test_memory_startup_and_evolution(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,16 +101,128 @@ def test_memory_startup_and_evolution(monkeypatch: pytest.MonkeyPatch) -> None:
     assert wanted <= set(rows)
     assert 20 < rows["memory.peak"].value < 2000
     assert rows["memory.peak"].batch == 30
-    assert rows["evolution.wall"].value > rows["evolution.simulation"].value > 0
+    shares = [rows[f"evolution.{part}"].value for part in ("simulation", "strategy", "disk", "python")]
+    assert min(shares) > 0
+    assert sum(shares) == pytest.approx(rows["evolution.wall"].value)
+
+
+# --- scaling ----------------------------------------------------------------------------------------------------------
+
+
+def test_scaling_has_a_row_for_every_point_of_its_curves() -> None:
+    rows = list(scaling.scaling(TINY))
+    threads = [t for t in (1, 2) if t <= available_cores()]
+    points = [(row.batch, row.threads) for row in rows_of(rows, "scaling.batch")]
+    assert points == [(batch, t) for batch in (1, 20) for t in threads]
+    points = [(row.size, row.controllers) for row in rows_of(rows, "scaling.masses")]
+    assert points == [(masses, shape) for masses in (10, 30) for shape in scaling.SHAPES]
+    assert [row.size for row in rows_of(rows, "scaling.segments")] == [10, 100]
+    (growth,) = rows_of(rows, "scaling.segments.growth")
+    (short, long) = rows_of(rows, "scaling.segments")
+    assert growth.value == pytest.approx(short.value / long.value)
+    assert [row.threads for row in rows_of(rows, "scaling.threads")] == scaling.thread_counts(available_cores())
+    assert all(row.value > 0 and row.unit and row.what for row in rows)
+    assert len({bench.report.identity(row) for row in rows}) == len(rows)
+
+
+def test_thread_counts_end_with_all_cores() -> None:
+    assert [scaling.thread_counts(cores) for cores in (1, 2, 6, 8)] == [[1], [1, 2], [1, 2, 4, 6], [1, 2, 4, 8]]
+
+
+def test_terrains_have_their_segments_and_starts_all_over_them() -> None:
+    for segments in (10, 1000):
+        task = scaling.terrain_task(segments, 1)
+        assert len(task.scene.segments) == segments
+        starts = scaling.spread_starts(task, 7)
+        left, right = task.scene.segments[0, 0], task.scene.segments[-1, 0]
+        assert left < starts[..., 0].min() < left + 2 * scaling.ROOM
+        assert right - 2 * scaling.ROOM < starts[..., 0].max() < right
+
+
+def test_a_step_costs_no_more_on_a_long_terrain() -> None:
+    """A thousand times the segments. Where agents were put at the start by walking through the terrain's columns, these
+    20 steps took 6 times as long; a walk in every step would take far longer."""
+    times = scaling.segment_times((10, 10_000), agents=64, steps=20, seconds=0.1, repeats=20)
+    assert times[10_000] < 3 * times[10]
+
+
+def test_bodies_of_the_curves_are_what_they_are_called() -> None:
+    """Inflated ones are discs, collapsed ones flat with masses on each other; points weigh as much, and pass by."""
+    steps, reach = 600, 1.02  # [m]: squares that touch face to face, skins included
+    area, touching = {}, {}
+    for shape in scaling.SHAPES:
+        task = scaling.ring_task(20, shape, steps)
+        np.testing.assert_allclose(task.body.mass, 2500)
+        out = Simulator(task).rollout(measuring.controllers("random", task, 16, 0))
+        area[shape] = (task.body.area(out.position)[:, 0] / task.area_reference[0]).mean()
+        apart = np.abs(out.position[:, :, None] - out.position[:, None]).max(axis=3)
+        i, j = np.triu_indices(20, 2)
+        touching[shape] = (apart[:, i, j][:, j - i < 19] < reach * task.body.side[0]).sum(axis=1).mean()
+    assert min(area["inflated"], area["inflated, passive"]) > 0.9
+    assert max(area["collapsed"], area["collapsed, points"]) < 0.1
+    assert touching["inflated"] == 0
+    assert touching["collapsed"] > 0.5
+    assert touching["collapsed, points"] < touching["collapsed"] / 5
+
+
+# --- environments -----------------------------------------------------------------------------------------------------
+
+
+def test_environment_rows() -> None:
+    rows = list(parts.environment(TINY))
+    threads = [t for t in (1, 2) if t <= available_cores()]
+    names = ["environment", "environment.rollout", "environment.overhead"]
+    assert [(row.name, row.batch, row.threads) for row in rows] == [(name, 5, t) for t in threads for name in names]
+    assert rows[2].value == pytest.approx(rows[1].value / rows[0].value)
+
+
+def test_environments_do_what_the_rollout_does() -> None:
+    """The same agents: as far as rounding, over the steps before chaos sets in."""
+    import gymnasium
+
+    task = measuring.make_task("hilly", "small", 30, "inflated")
+    theta = measuring.controllers("inflated", task, 5, 0)
+    envs: Any = gymnasium.make_vec("turgor/Hilly-v0", num_envs=5, steps=30, pressure_unit=1.0, seed_terrain=0)
+    assert envs.task.identity == task.identity
+    actions = parts.actions_of(envs, task, theta)
+    assert actions.shape == (30, 5, 11)
+    assert np.abs(actions[:, :, :-1]).max() > 0.1
+    envs.reset(seed=0)
+    for action in actions:
+        *_, info = envs.step(action)
+    np.testing.assert_allclose(info["fitness"], Simulator(task).rollout(theta).fitness, atol=1e-3)
+
+
+# --- peers ------------------------------------------------------------------------------------------------------------
 
 
 def test_peer_rows(peer: Any) -> None:
     rows = list(parts.peer(TINY))
-    names = ["peer.box2d", "peer.engine", "peer.engine", "peer.ratio", "peer.ratio", "peer.difference"]
+    others = list(parts.peers(peer))
+    names = [f"peer.{name}" for name in (*others, "engine", "engine")]
+    names += [name for other in others for name in 2 * [bench.report.ratio_name(other)]] + ["peer.difference"]
     assert [row.name for row in rows] == 3 * names
-    assert [row.batch for row in rows[:6]] == [1, 1, 20, 1, 20, 1]
-    assert rows[4].value == pytest.approx(rows[2].value / rows[0].value)
-    assert rows[5].value <= 1e-4
+    few, many = rows_of(rows, "peer.engine", controllers="random")
+    assert [few.batch, many.batch] == [1, 20]
+    for name in others:
+        (rate,) = rows_of(rows, f"peer.{name}", controllers="random")
+        ratios = rows_of(rows, bench.report.ratio_name(name), controllers="random")
+        assert [row.value for row in ratios] == pytest.approx([few.value / rate.value, many.value / rate.value])
+    assert max(row.value for row in rows_of(rows, "peer.difference")) <= 1e-4
+
+
+def test_peer_in_box2d_v3_is_the_agent_of_crosscheck(peer: Any) -> None:
+    pytest.importorskip("pyb2d3")
+    from turgor.fidelity.drive import new_trace, run
+    from turgor.fidelity.engines import load_world
+
+    task = make_task("hilly", body="small", steps=30)
+    theta = np.random.default_rng(1).uniform(-1, 1, (1, task.parameter_count))
+    trace = new_trace()
+    run(load_world("box2d-v3"), task, theta, task.position[None], trace=trace)
+    there = peer.trajectory(task, theta[0], 30, peer.AgentV3)
+    np.testing.assert_allclose(there, trace.position, rtol=0, atol=1e-4)
+    assert np.abs(there - peer.trajectory(task, theta[0], 30)).max() > 1e-4  # another solver
 
 
 @pytest.mark.parametrize("task_name", ["hilly", "flat"])
@@ -156,6 +281,82 @@ def test_command_compares_with_an_earlier_run(kind: str, tmp_path: Path, capsys:
     for line in compared:
         before, now, ratio = map(float, line.split()[-3:])
         assert ratio == pytest.approx(now / before, rel=0.002, abs=0.001)  # as far as figures are printed
+
+
+def test_files_without_the_column_size_still_compare(tmp_path: Path) -> None:
+    rows = [bench.Row(name="kernel", batch=1, value=2.0, unit="s", what="before")]
+    text = bench.as_csv(rows, bench.environment()).replace(",size,", ",").replace(",1,,,2", ",1,,2")
+    (tmp_path / "old.csv").write_text(text, encoding="utf-8")
+    assert "size" not in text
+    assert read_record(tmp_path / "old.csv").rows == rows
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_published_page_says_what_its_rows_say() -> None:
+    """Where this fails: ./run turgor bench --from benchmarks/results/MACHINE.csv --page docs"""
+    text = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
+    machine = text.partition("--from benchmarks/results/")[2].partition(".csv")[0]
+    record = read_record(RECORDS / f"{machine}.csv")
+    assert text == page.page_text(record)
+    for line in text.splitlines():
+        if line.startswith("!["):
+            picture = line.partition("](")[2].rstrip(")")
+            assert (DOCS / picture).stat().st_size > 10_000
+
+
+@pytest.mark.usefixtures("tiny")
+def test_page_is_the_same_from_measuring_and_from_its_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(parts, "FIRST_ROLLOUT", "pass")  # compiling takes long
+    rows, new, again = tmp_path / "rows.csv", tmp_path / "new", tmp_path / "again"
+    assert bench.main(["--quick", "--csv", str(rows), "--page", str(new)]) == 0
+    assert bench.main(["--from", str(rows), "--page", str(again)]) == 0
+    text = (new / "benchmarks.md").read_text(encoding="utf-8")
+    assert (again / "benchmarks.md").read_text(encoding="utf-8") == text
+    heads = [line for line in text.splitlines() if line.startswith("## ")]
+    assert heads[:5] == [
+        *("## The kernel", "## How it scales", "## Environments", "## Whole evolutions", "## Start and memory")
+    ]
+    assert "nan" not in text
+    for name in (page.SCALING, page.EVOLUTION):
+        assert (again / "images" / name).read_bytes() == (new / "images" / name).read_bytes()
+    assert "segments" in capsys.readouterr().out
+
+
+def test_parts_that_were_not_measured_are_left_out_of_the_page() -> None:
+    facts = bench.environment()
+    rows = [bench.Row(name="startup.help", value=0.04, unit="s", what="turgor --help")]
+    text = page.page_text(page.Record(facts=facts, rows=rows))
+    assert "| turgor --help | 0.04 s |" in text
+    assert "How it scales" not in text
+    assert "Peers" not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--from", "nowhere.csv"], "expected a file of an earlier run"),
+        (["--from", "rows.json", "--only", "kernel"], "--from: expected with --page or --compare alone"),
+        (["--from", "rows.json"], "expected what --csv or --json wrote; got no cpu"),
+        (["--page", "rows.json"], "--page: expected a folder"),
+    ],
+)
+def test_wrong_sources_and_pages_are_told(
+    arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rows.json").write_text('{"rows": [{"name": "x", "value": 1, "unit": "s", "what": ""}]}', encoding="utf-8")
+    assert bench.main(arguments) == 2
+    printed = capsys.readouterr()
+    assert told in printed.err
+    assert printed.err.count("\n") == 1
+    assert printed.out == ""
+
+
+# --- what cannot be ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"rows": [{}]}', "name,value\nx,y\n", "name\nx\n"])

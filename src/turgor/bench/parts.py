@@ -5,138 +5,28 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import subprocess
-import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
-from turgor.bench.report import Row, say
-
-SEED = 0  # of controllers and of the evolution that finds evolved ones
-MILLION = 1e6
-PEER = Path(__file__).parents[3] / "benchmarks" / "box2d_peer.py"  # not part of the installed package
-
-
-class Plan(msgspec.Struct, frozen=True):
-    """How much is measured; the defaults are the whole benchmark."""
-
-    bodies: tuple[str, ...] = ("small", "medium", "large")
-    tasks: tuple[str, ...] = ("hilly", "escape")
-    controllers: tuple[str, ...] = ("random", "inflated", "evolved")
-    batches: tuple[int, ...] = (1, 20, 1024)
-    threads: tuple[int, ...] = (1, 2)
-    steps: int = 1800  # of a rollout
-    seconds: float = 0.5  # of measuring, at least, for every row
-    repeats: int = 3  # at least
-    generations: int = 80  # of the evolution behind evolved controllers
-    memory_body: str = "large"
-    memory_agents: int = 10_000
-    starts: int = 5  # of a process
-    evaluations: int = 10_000
-    peer_bodies: tuple[str, ...] = ("large", "small")
-    peer_agents: int = 6  # that the peer runs, one after the other
-    peer_batch: int = 1024  # that the engine runs beside it
-
-
-QUICK = Plan(
-    bodies=("large",),
-    batches=(1, 20, 256),
-    seconds=0.1,
-    generations=20,
-    memory_agents=2000,
-    starts=2,
-    evaluations=1000,
-    peer_bodies=("large",),
-    peer_agents=2,
-    peer_batch=256,
+from turgor.bench.measuring import (
+    MILLION,
+    SEED,
+    Plan,
+    Skipped,
+    controllers,
+    fastest,
+    make_task,
+    run_python,
+    usable_threads,
+    warm_up,
 )
+from turgor.bench.report import PEERS, Row, ratio_name, say
+from turgor.bench.scaling import scaling
 
-
-class Skipped(Exception):
-    """A part that cannot be measured here; says why."""
-
-
-# --- measuring --------------------------------------------------------------------------------------------------------
-
-
-def fastest(calls: Sequence[Callable[[], object]], seconds: float, repeats: int) -> list[float]:
-    """Shortest time [s] of each of `calls`. They take turns, so that what slows one slows all; at least `repeats`
-    rounds, and more until every call has had `seconds`."""
-    best, spent, rounds = [float("inf")] * len(calls), [0.0] * len(calls), 0
-    while rounds < repeats or min(spent) < seconds:
-        for k, call in enumerate(calls):
-            began = time.perf_counter()
-            call()
-            took = time.perf_counter() - began
-            best[k], spent[k] = min(best[k], took), spent[k] + took
-        rounds += 1
-    return best
-
-
-@cache
-def make_task(name: str, body: str, steps: int, kind: str = "random") -> Any:
-    """The benchmark's `Task` for a kind of controllers: terrain 0, pressure and springs controlled. "inflated" bodies
-    keep their gas, because their pressure moves by the paper's 1 Pa per unit of output, 27 to 53 times less."""
-    from turgor.task import make_task
-
-    unit = 1.0 if kind == "inflated" else None
-    return make_task(name, body=body, condition="pressure", seed=SEED, steps=steps, pressure_unit=unit)
-
-
-def controllers(kind: str, task: Any, agents: int, generations: int) -> Any:
-    """Controllers theta [agent, parameter]: "random" and "inflated" (uniform in [-1, 1]) or "evolved"; the first are
-    the same whatever `agents`."""
-    import numpy as np
-
-    if kind != "evolved":
-        return np.random.default_rng(SEED).uniform(-1, 1, (agents, task.parameter_count))
-    champion, strategy, drawn = evolved(task, generations)
-    while len(drawn) < agents:
-        drawn.extend(strategy.ask())
-    return np.array([champion, *drawn[: agents - 1]])
-
-
-@cache
-def evolved(task: Any, generations: int) -> tuple[Any, Any, list[Any]]:
-    """The champion of a short CMA-ES run, its strategy, whose draws are the population around it, and no draws yet."""
-    import numpy as np
-
-    from turgor.evolution.cma_es import CMAES
-    from turgor.simulate import Simulator
-
-    say(f"evolving controllers: {task.name}, {task.body.mass_count} masses, {generations} generations")
-    simulator = Simulator(task)
-    strategy = CMAES(task.parameter_count, np.random.default_rng(SEED))
-    best, champion = -np.inf, None
-    for _ in range(generations):
-        theta = strategy.ask()
-        fitness = simulator.rollout(theta).fitness
-        strategy.tell(theta, fitness)
-        if fitness.max() > best:
-            best, champion = fitness.max(), theta[fitness.argmax()]
-    return champion, strategy, []
-
-
-def run_python(*arguments: str, **environment: str) -> tuple[float, str]:
-    """Wall time [s] from the start to the end of a Python process, and what it printed."""
-    began = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, *arguments], env={**os.environ, **environment}, capture_output=True, text=True, check=False
-    )
-    took = time.perf_counter() - began
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["nothing on stderr"])[-1]
-        raise RuntimeError(f"a process of the benchmark ended with status {done.returncode}: {last}")
-    return took, done.stdout
-
-
-# --- the parts --------------------------------------------------------------------------------------------------------
+PEER = Path(__file__).parents[3] / "benchmarks" / "box2d_peer.py"  # not part of the installed package
 
 
 def kernel(plan: Plan) -> Iterator[Row]:
@@ -169,33 +59,69 @@ def kernel_rows(plan: Plan, body: str, name: str, kind: str, batch: int, threads
             yield Row(name="kernel.scaling", **same, threads=t, value=rate / rates[0], unit="times", what=what)
 
 
-def usable_threads(threads: Sequence[int]) -> list[int]:
-    """Those numbers of threads that there are cores for."""
-    from turgor.simulate import available_cores
-
-    usable = [t for t in threads if t <= available_cores()]
-    if len(usable) < len(threads):
-        say(f"{available_cores()} core: no rows with more threads than that")
-    return usable
+def environment(plan: Plan) -> Iterator[Row]:
+    """Rows: million agent-steps/s through Gymnasium's interface, and of the same work as a rollout."""
+    threads = usable_threads(plan.threads)
+    for body in plan.environment_bodies:
+        for agents in plan.environments:
+            yield from environment_rows(plan, body, agents, threads)
 
 
-def peak_memory() -> int:
-    """Peak resident memory of this process [byte]. Raises `Skipped` on Windows, which does not tell."""
-    try:  # of this program alone; the other counts its parent until it was loaded
-        with open("/proc/self/status", encoding="ascii") as file:
-            return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM"))
-    except OSError:
-        pass
-    if sys.platform == "win32":
-        raise Skipped("peak memory is not told on Windows")
-    import resource
+def environment_rows(plan: Plan, body: str, agents: int, threads: list[int]) -> Iterator[Row]:
+    """Rows of one number of environments: stepped and rolled out, on each number of threads, all in turn."""
+    import gymnasium
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    from turgor.simulate import Simulator
+
+    kind = "inflated"
+    task = make_task("hilly", body, plan.steps, kind)
+    theta = controllers(kind, task, agents, plan.generations)
+    how: dict[str, Any] = {"body": body, "steps": plan.steps, "pressure_unit": task.pressure_unit, "seed_terrain": SEED}
+    envs = [gymnasium.make_vec("turgor/Hilly-v0", num_envs=agents, threads=t, **how) for t in threads]
+    actions = actions_of(envs[-1], task, theta)
+    calls: list[Callable[[], object]] = [partial(play, each, actions) for each in envs]
+    calls += [partial(Simulator(task, threads=t).rollout, theta) for t in threads]
+    times = fastest(calls, plan.curve_seconds, plan.repeats)
+    same: dict[str, Any] = {"body": body, "task": "hilly", "controllers": kind, "batch": agents}
+    for t, stepped, rolled in zip(threads, times, times[len(threads) :], strict=False):
+        rates = [agents * plan.steps / took / MILLION for took in (stepped, rolled)]
+        what = f"make_vec stepped {plan.steps} times, with the actions that the controllers gave before"
+        yield Row(name="environment", **same, threads=t, value=rates[0], unit="M agent-steps/s", what=what)
+        what = "the same agents with their controllers in one rollout, measured in turn"
+        yield Row(name="environment.rollout", **same, threads=t, value=rates[1], unit="M agent-steps/s", what=what)
+        what = "how many times as long stepping takes"
+        yield Row(name="environment.overhead", **same, threads=t, value=stepped / rolled, unit="times", what=what)
+
+
+def actions_of(envs: Any, task: Any, theta: Any) -> Any:
+    """What linear controllers `theta` [agent, parameter] do in `envs` over a whole episode, float32
+    [step, agent, output]."""
+    import numpy as np
+
+    from turgor.control import rows
+
+    weight, bias = rows(theta, task.body, task.condition)
+    actions = np.empty((task.steps, *envs.action_space.shape), dtype=np.float32)
+    springs = task.body.spring_count
+    observation, _ = envs.reset(seed=SEED)
+    for action in actions:
+        output = np.matmul(weight, observation[:, :, None])[:, :, 0] + bias
+        action[:, :springs] = np.tanh(output[:, :springs])
+        action[:, springs:] = np.clip(output[:, springs:], -1, 1)
+        observation = envs.step(action)[0]
+    return actions
+
+
+def play(envs: Any, actions: Any) -> None:
+    """A whole episode of all environments."""
+    envs.reset(seed=SEED)
+    for action in actions:
+        envs.step(action)
 
 
 MEMORY = """
 import sys, numpy, turgor
-from turgor.bench.parts import peak_memory
+from turgor.bench.measuring import peak_memory
 body, agents, steps = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 task = turgor.make_task("hilly", body=body, steps=steps)
 theta = numpy.random.default_rng(0).uniform(-1, 1, (agents, task.parameter_count))
@@ -254,47 +180,61 @@ def quickest_start(plan: Plan, *arguments: str, **environment: str) -> float:
     return min(run_python(*arguments, **environment)[0] for _ in range(plan.starts))
 
 
-def warm_up() -> None:
-    """Has the engine compiled and in its file."""
-    import numpy as np
-
-    from turgor.simulate import Simulator
-
-    task = make_task("hilly", "small", 1)
-    Simulator(task).rollout(np.zeros((1, task.parameter_count)))
-
-
 EVOLUTION = """
-import json, sys, turgor
+import json, sys, time, turgor
 import numpy as np
-run = turgor.evolve(turgor.make_task(), evaluations=int(sys.argv[1]), seed=0, out=sys.argv[2])
+from turgor.runs import Run
+
+disk = 0.0
+
+def timed(write):
+    def write_and_count(*given):
+        global disk
+        began = time.perf_counter()
+        write(*given)
+        disk += time.perf_counter() - began
+    return write_and_count
+
+for name in ("add", "write_champion", "write_checkpoint", "write_record"):  # all that a run writes
+    setattr(Run, name, timed(getattr(Run, name)))
+task = turgor.make_task("hilly", body=sys.argv[1])
+run = turgor.evolve(task, evaluations=int(sys.argv[2]), seed=0, out=sys.argv[3])
 best = run.champion
-print(json.dumps({"seconds": run.seconds, "best": best.fitness, "robust": float(np.median(best.robust)),
-                  "population": run.settings.population, "threads": run.settings.threads}))
+print(json.dumps({"seconds": run.seconds | {"disk": disk}, "best": best.fitness,
+                  "robust": float(np.median(best.robust)), "population": run.settings.population,
+                  "threads": run.settings.threads}))
 """
 
 
 def evolution(plan: Plan) -> Iterator[Row]:
-    """Rows: how long the default evolution takes, where the time goes, and what comes out."""
+    """Rows: how long the default evolution of each body takes, where the time goes, and what comes out."""
     warm_up()
-    with tempfile.TemporaryDirectory() as folder:
-        wall, out = run_python("-c", EVOLUTION, str(plan.evaluations), str(Path(folder) / "run"))
-    told = json.loads(out.splitlines()[-1])
-    what = f"{plan.evaluations} evaluations, seed 0"
+    for body in plan.bodies:
+        with tempfile.TemporaryDirectory() as folder:
+            wall, out = run_python("-c", EVOLUTION, body, str(plan.evaluations), str(Path(folder) / "run"))
+        yield from evolution_rows(body, plan.evaluations, wall, json.loads(out.splitlines()[-1]))
+
+
+def evolution_rows(body: str, evaluations: int, wall: float, told: dict[str, Any]) -> Iterator[Row]:
+    """Rows of one evolution: its parts add up to the whole process."""
+    what, seconds = f"{evaluations} evaluations, seed 0", told["seconds"]
+    outside = wall - seconds["simulation"] - seconds["strategy"] - seconds["disk"]
     figures = [
         ("evolution.wall", wall, "s", f"{what}: the whole process, engine cached, no video"),
-        ("evolution.simulation", told["seconds"]["simulation"], "s", f"{what}: of which in rollouts"),
-        ("evolution.strategy", told["seconds"]["strategy"], "s", f"{what}: of which in CMA-ES"),
+        ("evolution.simulation", seconds["simulation"], "s", f"{what}: of which in rollouts"),
+        ("evolution.strategy", seconds["strategy"], "s", f"{what}: of which in CMA-ES"),
+        ("evolution.disk", seconds["disk"], "s", f"{what}: of which writing the run's files"),
+        ("evolution.python", outside, "s", f"{what}: all else: Python's start, imports, loading the engine, the loop"),
         ("evolution.best", told["best"], "m/s", f"{what}: fitness of the champion"),
         ("evolution.robust", told["robust"], "m/s", f"{what}: median of the champion's perturbed starts"),
     ]
     for name, value, unit, what in figures:
-        yield Row(name=name, body="small", task="hilly", controllers="evolved", batch=told["population"],
+        yield Row(name=name, body=body, task="hilly", controllers="evolved", batch=told["population"],
                   threads=told["threads"], value=value, unit=unit, what=what)  # fmt: skip
 
 
 def peer(plan: Plan) -> Iterator[Row]:
-    """Rows: the same agent in a pybox2d program and in the engine, in turn, both on one core."""
+    """Rows: the same agent in programs on other engines and in this one, in turn, all on one core."""
     box2d_peer = load_peer()
     for body in plan.peer_bodies:
         for kind in plan.controllers:
@@ -302,7 +242,7 @@ def peer(plan: Plan) -> Iterator[Row]:
 
 
 def peer_rows(plan: Plan, box2d_peer: Any, body: str, kind: str) -> Iterator[Row]:
-    """Rows of one body: three rates, the engine's two against the peer's, and how far apart their agents are."""
+    """Rows of one body: the rates, the engine's against the peers', and how far apart the agents are."""
     from threadpoolctl import threadpool_limits
 
     from turgor.simulate import Simulator
@@ -312,31 +252,42 @@ def peer_rows(plan: Plan, box2d_peer: Any, body: str, kind: str) -> Iterator[Row
     many = controllers(kind, task, plan.peer_batch, plan.generations)
     few = many[: plan.peer_agents]
 
-    def each(run: Callable[[Any], object]) -> None:
+    def each(run: Callable[..., object], *given: Any) -> None:
         for theta in few:
-            run(theta)
+            run(theta, *given)
 
-    calls = [
-        lambda: each(lambda theta: box2d_peer.rollout(task, theta)),
-        lambda: each(lambda theta: simulator.rollout(theta[None])),
-        lambda: simulator.rollout(many),
-    ]
+    others = peers(box2d_peer)
+    calls: list[Callable[[], object]] = []
+    calls += [partial(each, partial(box2d_peer.rollout, task), agent) for agent in others.values()]
+    calls += [lambda: each(lambda theta: simulator.rollout(theta[None])), lambda: simulator.rollout(many)]
     with threadpool_limits(1):
         times = fastest(calls, plan.seconds, plan.repeats)
-    agents, batches = [len(few), len(few), len(many)], [1, 1, len(many)]
-    rates = [n * plan.steps / took / MILLION for n, took in zip(agents, times, strict=True)]
+    rates = [len(few) * plan.steps / took / MILLION for took in times[:-1]]
+    rates.append(len(many) * plan.steps / times[-1] / MILLION)
     same: dict[str, Any] = {"body": body, "task": "hilly", "controllers": kind, "threads": 1}
-    subjects = ("pybox2d, ", "the engine, ", "the engine, ")
-    for k, (name, subject) in enumerate(zip(("peer.box2d", "peer.engine", "peer.engine"), subjects, strict=True)):
-        what = subject + (f"{len(few)} agents one after the other" if batches[k] == 1 else "all agents at once")
-        yield Row(name=name, **same, batch=batches[k], value=rates[k], unit="M agent-steps/s", what=what)
-    for k in (1, 2):
-        what = "the engine against pybox2d, measured in turn"
-        yield Row(name="peer.ratio", **same, batch=batches[k], value=rates[k] / rates[0], unit="times", what=what)
+    told = [*(f"{PEERS[name]}, {len(few)} agents one after the other" for name in others)]
+    told += [f"the engine, {len(few)} agents one after the other", "the engine, all agents at once"]
+    names, batches = [*others, "engine", "engine"], [1] * (len(others) + 1) + [len(many)]
+    for name, batch, rate, what in zip(names, batches, rates, told, strict=True):
+        yield Row(name=f"peer.{name}", **same, batch=batch, value=rate, unit="M agent-steps/s", what=what)
+    for k, name in enumerate(others):
+        for batch, rate in zip((1, len(many)), rates[-2:], strict=True):
+            what = f"the engine against {PEERS[name]}, measured in turn"
+            yield Row(name=ratio_name(name), **same, batch=batch, value=rate / rates[k], unit="times", what=what)
     together = min(30, plan.steps)
     there, here = box2d_peer.trajectory(task, few[0], together), simulator.record(few[0]).position[: together + 1]
     what = f"largest difference of a coordinate between pybox2d and the engine in the first {together} steps"
     yield Row(name="peer.difference", **same, batch=1, value=float(abs(there - here).max()), unit="m", what=what)
+
+
+def peers(box2d_peer: Any) -> dict[str, Any]:
+    """The agents of the peers that can run here, by name."""
+    from turgor.fidelity.engines import installed
+
+    if "box2d-v3" in installed():
+        return {"box2d": box2d_peer.Agent, "box2d-v3": box2d_peer.AgentV3}
+    say("Box2D v3 (the package pyb2d3) cannot be imported: no rows for it")
+    return {"box2d": box2d_peer.Agent}
 
 
 @cache
@@ -355,6 +306,8 @@ def load_peer() -> Any:
 
 PARTS: dict[str, Callable[[Plan], Iterator[Row]]] = {
     "kernel": kernel,
+    "scaling": scaling,
+    "environment": environment,
     "memory": memory,
     "startup": startup,
     "evolution": evolution,

@@ -17,6 +17,13 @@ import msgspec
 
 from turgor.errors import InvalidInput, describe
 
+PEERS = {"box2d": "Box2D 2.3", "box2d-v3": "Box2D v3"}  # other engines that run the same agent, by their rows' names
+
+
+def ratio_name(peer: str) -> str:
+    """The name of the rows that compare with `peer`."""
+    return "peer.ratio" if peer == "box2d" else f"peer.ratio.{peer}"
+
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
     """One figure. Fields that do not apply are empty."""
@@ -27,6 +34,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     controllers: str = ""
     batch: int | None = None  # agents at once
     threads: int | None = None
+    size: int | None = None  # masses of the body, or segments of the terrain, where that is what varies
     value: float
     unit: str
     what: str
@@ -102,7 +110,7 @@ def show_comparison(rows: Sequence[Row], before: Record, here: dict[str, str]) -
     title = f"against {before.facts.get('date', '?')}, turgor {before.facts.get('turgor', '?')}"
     if before.facts.get("machine") != here["machine"]:
         title += f"; ANOTHER MACHINE: {before.facts.get('cpu') or before.facts.get('machine', '?')}"
-    names = ("name", "body", "task", "controllers", "batch", "threads", "unit", "before", "now", "now / before")
+    names = ("name", "body", "task", "controllers", "batch", "threads", "size", "unit", "before", "now", "now / before")
     lines = [
         ["" if cell is None else str(cell) for cell in (*identity(now), now.unit)]
         + [f"{was.value:.4g}", f"{now.value:.4g}", f"{now.value / was.value:.3f}" if was.value else ""]
@@ -114,7 +122,12 @@ def show_comparison(rows: Sequence[Row], before: Record, here: dict[str, str]) -
 
 def identity(row: Row) -> tuple[str | int | None, ...]:
     """What a row is a figure of."""
-    return row.name, row.body, row.task, row.controllers, row.batch, row.threads
+    return row.name, row.body, row.task, row.controllers, row.batch, row.threads, row.size
+
+
+def rows_of(rows: Sequence[Row], name: str, **wanted: object) -> list[Row]:
+    """The rows of a `name` whose fields are as `wanted`."""
+    return [row for row in rows if row.name == name and all(getattr(row, k) == v for k, v in wanted.items())]
 
 
 def show_table(title: str, names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
@@ -125,7 +138,7 @@ def show_table(title: str, names: Sequence[str], lines: Sequence[Sequence[str]])
 
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
         for name in names:
-            right = name in ("batch", "threads", "value", "before", "now", "now / before")
+            right = name in ("batch", "threads", "size", "value", "before", "now", "now / before")
             table.add_column(name, justify="right" if right else "left", no_wrap=name != "what")
         for line in lines:
             table.add_row(*line)
@@ -155,16 +168,20 @@ def as_json(rows: Sequence[Row], here: dict[str, str]) -> str:
 def read_record(path: Path) -> Record:
     """What `as_csv` or `as_json` wrote. Raises `InvalidInput`."""
     try:
-        text = path.read_text(encoding="utf-8")
-        if text.lstrip().startswith("{"):
-            facts = json.loads(text)
-            rows = facts.pop("rows")
-        else:
-            rows = list(csv.DictReader(io.StringIO(text)))
-            facts = {name: value for name, value in rows[0].items() if name not in Row.__struct_fields__}
-            rows = [{name: line[name] for name in Row.__struct_fields__ if line[name] != ""} for line in rows]
-        return Record(facts=facts, rows=msgspec.convert(rows, list[Row], strict=False))
+        return record_of(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InvalidInput(f"{path}: expected a file of an earlier run", error.strerror) from None
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise InvalidInput(f"{path}: expected what --csv or --json wrote", describe(error)) from None
+
+
+def record_of(text: str) -> Record:
+    """The same from the file's text. Raises errors of many kinds for anything else."""
+    if text.lstrip().startswith("{"):
+        facts = json.loads(text)
+        rows = facts.pop("rows")
+    else:
+        rows = list(csv.DictReader(io.StringIO(text)))
+        facts = {name: value for name, value in rows[0].items() if name not in Row.__struct_fields__}
+        rows = [{name: line[name] for name in Row.__struct_fields__ if line.get(name)} for line in rows]
+    return msgspec.convert({"facts": facts, "rows": rows}, Record, strict=False)

@@ -21,7 +21,8 @@ def _bench(options: argparse.Namespace) -> int:
 
 BENCH = Command(
     "Measure how fast the engine is on this machine.",
-    "examples:\n  turgor bench --quick\n  turgor bench --csv results.csv\n  turgor bench --compare results.csv",
+    "examples:\n  turgor bench --quick\n  turgor bench --csv results.csv\n  turgor bench --compare results.csv\n"
+    "  turgor bench --page docs",
     _bench_options,
     _bench,
 )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import types
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -215,3 +215,9 @@ def _value(text: str | None, hint: Any) -> Any:
 
 def _wrong(text: str) -> Any:
     raise ValueError(f"{text!r} for a bool")
+
+
+def markdown_table(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """A table of a page: one line of `heads`, then `lines`."""
+    rows = [heads, ["---"] * len(heads), *lines]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

@@ -16,7 +16,7 @@ import msgspec
 
 from turgor.experiments.plan import BODIES
 from turgor.experiments.rows import Champion
-from turgor.files import write_whole
+from turgor.files import whole, write_whole
 
 WIDTH = 7.0  # [in]
 FORMATS = ("svg", "pdf", "png")
@@ -119,6 +119,12 @@ def make_sheet(height: float, layout: Any = "constrained") -> Any:
     figure = Sheet(figsize=(WIDTH, height), layout=layout)
     FigureCanvasAgg(figure)
     return figure
+
+
+def save_sheet(figure: Any, path: Path) -> None:
+    """Writes a figure as the picture of a page."""
+    with whole(path) as partial:
+        figure.savefig(partial, dpi=200)
 
 
 def note(axes: Any, text: str, at: tuple[float, float], aside: tuple[float, float], where: Any, **how: Any) -> None:

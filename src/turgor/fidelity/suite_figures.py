@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from turgor.experiments.sheets import GREY, INK, PALE, make_sheet, paper_style
+from turgor.experiments.sheets import GREY, INK, PALE, make_sheet, paper_style, save_sheet
 from turgor.fidelity.compare import HERE, name_of
 from turgor.fidelity.figures import LOOKS
 from turgor.fidelity.golden import Growth
 from turgor.fidelity.populations import AGAIN, BOX2D, WIDE, Crossed, Ranked
-from turgor.files import whole
 
 SCENES = {"free": "free flight", "flat": "plane", "hills": "hills", "cage": "cage", "gas": "gas law, plane"}
 SMALLEST = 1e-8  # [m], of what is drawn on a logarithmic axis
@@ -34,7 +33,7 @@ def draw_growth(rows: Sequence[Growth], path: Path) -> None:
             axes.set_xlabel("step")
         panels[0].set_ylabel("largest error [m]")
         _legend(figure, [e for e in LOOKS if e != BOX2D and any(r.engine == e for r in rows)], floor=True)
-        _save(figure, path)
+        save_sheet(figure, path)
 
 
 def _draw_course(rows: Sequence[Growth], engine: str, axes: Any) -> None:
@@ -72,7 +71,7 @@ def draw_ranks(rows: Sequence[Ranked], path: Path) -> None:
             axes.set_xlabel("Spearman's ρ of 60 random controllers")
         engines = [e for e in LOOKS if any(r.engine == e and r.against == BOX2D for r in rows)]
         _legend(figure, engines, floor=False, box2d="Box2D 2.3, start moved by 1e-6 m")
-        _save(figure, path)
+        save_sheet(figure, path)
 
 
 def draw_champions(rows: Sequence[Crossed], path: Path) -> None:
@@ -95,7 +94,7 @@ def draw_champions(rows: Sequence[Crossed], path: Path) -> None:
             axes.set_aspect("equal")
         panels[0].set_ylabel("median in another engine [m/s]")
         _legend(figure, [e for e in LOOKS if any(r.engine == e for r in rows)], floor=False)
-        _save(figure, path)
+        save_sheet(figure, path)
 
 
 def _legend(figure: Any, engines: Sequence[str], *, floor: bool, box2d: str = "") -> None:
@@ -113,8 +112,3 @@ def _legend(figure: Any, engines: Sequence[str], *, floor: bool, box2d: str = ""
             Line2D([], [], color=INK, linestyle="", marker="|", markersize=11, markeredgewidth=1.6, label=box2d)
         )
     figure.legend(handles=handles, loc="outside lower center", ncols=3 if len(handles) > 4 else len(handles))
-
-
-def _save(figure: Any, path: Path) -> None:
-    with whole(path) as partial:
-        figure.savefig(partial, dpi=200)

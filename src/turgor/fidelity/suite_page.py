@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from turgor.experiments.plan import BODIES
+from turgor.experiments.rows import markdown_table
 from turgor.experiments.statistics import holm
 from turgor.fidelity.compare import HERE, SURE, rank_correlation
 from turgor.fidelity.golden import STEPS
@@ -64,11 +65,6 @@ def page_text(suite: Suite) -> str:
 # --- text and tables ----------------------------------------------------------------------------------------------
 
 
-def _table(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    rows = [heads, ["---"] * len(heads), *lines]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
-
-
 def _names(suite: Suite) -> dict[str, str]:
     return {v.engine: v.says for v in suite.versions}
 
@@ -106,7 +102,7 @@ def _short(suite: Suite) -> str:
         "may count one accident many times; from the latter each meets its own. Significant is "
         f"p < {SURE} of a Kolmogorov-Smirnov test, by Holm's correction for all that are compared."
     )
-    return _table(["what", "goal", "measured", ""], lines) + f"\n{told}\n"
+    return markdown_table(["what", "goal", "measured", ""], lines) + f"\n{told}\n"
 
 
 def _short_ranks(suite: Suite) -> tuple[str, str, str, str]:
@@ -234,7 +230,7 @@ def _golden(suite: Suite) -> str:
         ]
         for case in cases
     ]
-    text += _details(f"All {len(cases)} courses", _table(heads, lines))
+    text += _details(f"All {len(cases)} courses", markdown_table(heads, lines))
     errors = {(row.case, row.engine): row for row in suite.squares}
     squares = dict.fromkeys((row.case, row.says) for row in suite.squares)
     heads = ["case", "", *(f"{names[e]}: position [m], velocity [m/s]" for e in engines)]
@@ -246,7 +242,7 @@ def _golden(suite: Suite) -> str:
         ]
         for case, says in squares
     ]
-    text += "\n" + _details(f"All {len(lines)} cases of squares: largest errors", _table(heads, lines))
+    text += "\n" + _details(f"All {len(lines)} cases of squares: largest errors", markdown_table(heads, lines))
     lines = [
         [
             body,
@@ -260,7 +256,7 @@ def _golden(suite: Suite) -> str:
         for body in BODIES
     ]
     told = "The inflation test (RQ0), 30 s on a plane: error of the area ratio in windows of 1 s, worst and median"
-    return f"{text}\n{told}.\n\n" + _table(["body", *(names[e] for e in engines)], lines)
+    return f"{text}\n{told}.\n\n" + markdown_table(["body", *(names[e] for e in engines)], lines)
 
 
 def _details(summary: str, text: str) -> str:
@@ -282,7 +278,7 @@ def _contacts(suite: Suite) -> str:
         for case, unit, theory in questions
     ]
     note = "Box2D v3 has no skin around its squares, so that they rest 1.5 cm lower.\n"
-    return _table(["case", "theory", *(v.says for v in suite.versions)], lines) + "\n" + note
+    return markdown_table(["case", "theory", *(v.says for v in suite.versions)], lines) + "\n" + note
 
 
 # --- random controllers -------------------------------------------------------------------------------------------
@@ -298,7 +294,7 @@ def _random(suite: Suite) -> str:
         "![ranks](images/fidelity-ranks.png)\n\n"
     )
     heads = ["task, body, condition", "engine", "against", "ranks", "KS, p", "means", "medians"]
-    return text + _table(heads, [_random_line(row, names) for row in suite.random])
+    return text + markdown_table(heads, [_random_line(row, names) for row in suite.random])
 
 
 def _random_line(row: Ranked, names: dict[str, str]) -> list[str]:
@@ -338,7 +334,7 @@ def _champions(suite: Suite) -> str:
             rows = [row for row in _of(suite.champions, engine, task, moved) if row.body == body]
             if rows:
                 lines.append([f"{task}, {body}, {moved:g} m", names[engine], *_summary(rows)])
-    text += _table(heads, lines) + "\n"
+    text += markdown_table(heads, lines) + "\n"
     for task, moved in product(("hilly", "escape"), (NEEDLE, WIDE)):
         rows = [r for r in suite.champions if (r.task, r.moved) == (task, moved) and r.engine != BOX2D + AGAIN]
         text += _details(f"All champions: {task}, starts moved by {moved:g} m", _champion_table(rows, names)) + "\n"
@@ -380,4 +376,4 @@ def _champion_table(rows: Sequence[Crossed], names: dict[str, str]) -> str:
         ]
         for row in rows
     ]
-    return _table(heads, lines)
+    return markdown_table(heads, lines)

@@ -173,6 +173,20 @@ def first_column(settings, lane):
 
 
 @inlined
+def column_at(settings, ground, lane, x):
+    """The column of a lane's scene that holds x, looked for by halves: long scenes cost hardly more than short ones."""
+    low = first_column(settings, lane)
+    high = low + settings.columns - 1
+    while low < high:
+        middle = (low + high) // 2
+        if x < ground.right[middle]:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@inlined
 def find_column(settings, ground, lane, x, cell):
     """The column of a lane's scene that holds x, looked for from `cell` on: mostly its neighbour."""
     first = first_column(settings, lane)

@@ -5,7 +5,7 @@ from numba import types
 
 from turgor.physics.actuate import actuate, agent_of, take_commands, take_lengths
 from turgor.physics.build import rare, stage
-from turgor.physics.contacts import find_ground_contacts, find_pair_contacts, first_column, note_travel
+from turgor.physics.contacts import column_at, find_ground_contacts, find_pair_contacts, note_travel
 from turgor.physics.control import control
 from turgor.physics.engine import COUNTS, LASTING, PASSING
 from turgor.physics.lanes import any_lane, select
@@ -62,7 +62,7 @@ def step(settings, model, ground, state, work, brain, script, commands, drive, f
 
 
 @rare
-def begin(settings, model, state, work, result, fresh, position, velocity, first, t):
+def begin(settings, model, ground, state, work, result, fresh, position, velocity, first, t):
     """Puts those of the agents `first` ... that are `fresh` [agent] at `position` [agent, mass, 2], at rest lengths and
     without a past, and makes their first observation, after t steps of the block. The others stay as they are."""
     agents = len(fresh)
@@ -70,7 +70,7 @@ def begin(settings, model, state, work, result, fresh, position, velocity, first
     for lane in range(settings.lanes):
         agent = agent_of(first, lane, agents)
         if fresh[agent]:
-            put_at_start(settings, model, state, result, position, velocity, agent, lane)
+            put_at_start(settings, model, ground, state, result, position, velocity, agent, lane)
             begun = True
     if begun:
         state.travel[0] = 0.0  # all pairs are looked at again
@@ -80,7 +80,7 @@ def begin(settings, model, state, work, result, fresh, position, velocity, first
 
 
 @rare
-def put_at_start(settings, model, state, result, position, velocity, agent, lane):
+def put_at_start(settings, model, ground, state, result, position, velocity, agent, lane):
     """One agent into one lane."""
     for i in range(settings.masses):
         state.x[i, lane] = position[agent, i, 0]
@@ -88,10 +88,10 @@ def put_at_start(settings, model, state, result, position, velocity, agent, lane
         state.vx[i, lane] = velocity[agent, i, 0]
         state.vy[i, lane] = velocity[agent, i, 1]
         state.touch[i, lane] = 0.0
-        # outside any column, so that the first step looks its column up
+        # not in it yet, so that the first step enters it
         state.left[i, lane] = np.inf
         state.right[i, lane] = -np.inf
-        state.cell[i, lane] = first_column(settings, lane)
+        state.cell[i, lane] = column_at(settings, ground, lane, position[agent, i, 0])
         state.listed[i, lane] = 0
     for j in range(settings.springs):
         state.rest[j, lane] = model.rest[j]
@@ -208,7 +208,7 @@ def run_blocks(
         first = block * lane_count(width)
         row = 0
         if len(fresh) > 0:
-            begin(settings, model, state, work, result, fresh, position, velocity, first, first_step)
+            begin(settings, model, ground, state, work, result, fresh, position, velocity, first, first_step)
             if recording:
                 record(settings, state, work, trace, row)
                 row += 1
