@@ -24,7 +24,7 @@ from turgor.view.draw import Painter, checked_size
 X264 = {
     "crf": "24",
     "preset": "superfast",
-    "x264-params": "ref=1:weightp=0:subme=0:8x8dct=0:rc-lookahead=0:sync-lookahead=0:mbtree=0:scenecut=0",
+    "x264-params": "ref=1:bframes=0:weightp=0:subme=0:8x8dct=0:rc-lookahead=0:sync-lookahead=0:mbtree=0:scenecut=0",
 }
 VP9 = {"crf": "32", "b": "0", "deadline": "realtime", "cpu-used": "7"}
 # suffix: encoder, its options, the container's options
