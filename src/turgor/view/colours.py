@@ -29,7 +29,7 @@ def ycbcr(colour: Colour) -> Colour:
     """The colour as a video holds it: its Cr, Y, Cb in place of red, green, blue (BT.709, limited range).
 
     Both mix alike, because one is a linear function of the other: a picture that is drawn in these colours is, up to
-    rounding, the picture drawn in RGB and then converted, for a quarter of the time.
+    rounding, the picture drawn in RGB and then converted, in less time.
     """
     red, green, blue, *alpha = colour
     luma = 0.2126 * red + 0.7152 * green + 0.0722 * blue

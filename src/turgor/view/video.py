@@ -123,6 +123,7 @@ def _encode(
             before = encoder.submit(int)  # nothing yet
             for k, step in enumerate(steps):
                 picture = pictures[k % 2]
+                picture.make_writable()  # a copy, should the encoder still read it
                 put_planes(painter.surface(step), *map(_plane, picture.planes))
                 before.result()
                 before = encoder.submit(encode, picture, k)
