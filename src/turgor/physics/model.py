@@ -12,6 +12,17 @@ import numpy as np
 from turgor.physics.memory import Floats, FloatTable, Ints, IntTable
 
 WIDTH = 16  # agents in a block: one AVX-512 vector; see ARCHITECTURE.md
+
+
+class Block(NamedTuple):
+    """How the agents of a block lie: so many `lanes` are one value, so many agents are `abreast` in memory."""
+
+    lanes: int
+    abreast: int
+
+
+ON_CPU = Block(WIDTH, WIDTH)
+ON_GPU = Block(1, 32)  # an agent a thread; what the 32 threads of a warp read is one cache line
 NOWHERE = -1
 UNKNOWN = -2  # a slot that has not been filled yet
 LOOK_AGAIN = 64  # [step], after which all pairs are looked at, so that `travel` gathers no rounding errors
