@@ -8,6 +8,7 @@ from pathlib import Path
 
 import av
 import numpy as np
+import pygame
 import pytest
 
 from turgor import body as bodies
@@ -16,6 +17,8 @@ from turgor.body import GAS_CONSTANT, Body
 from turgor.errors import InvalidInput
 from turgor.recording import Recording
 from turgor.scene import Scene, highest_ground
+from turgor.view import scenery
+from turgor.view.colours import put_planes, ycbcr
 from turgor.view.draw import Painter, draw_frame
 from turgor.view.figures import fitness_figure
 from turgor.view.shapes import PRESSURE_MAP, SOLID, STRAIN_MAP, closed_loops, span, wall_shapes
@@ -236,6 +239,51 @@ def test_drawing_needs_no_display_and_starts_none() -> None:
         text=True,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+# --- what frames share ---
+
+
+@pytest.mark.parametrize("scene", [scenes.hills(0), CAGE], ids=["hills", "cage"])
+def test_scenery_moves_with_the_camera_and_keeps_its_looks(scene: Scene) -> None:
+    """Moved by whole pixels, the world is the same picture, moved: no part of it shivers."""
+    recording = rolling(scene=scene, seconds=0.1)
+    painter = Painter(recording)
+    surface, seen = pygame.Surface(painter.size, 0, 32), []
+    for move in ((0, 0), (7, 4), (0, 0)):
+        painter.camera.centre[1] = painter.camera.centre[0] + np.array(move) / painter.camera.scale
+        surface.fill((0, 0, 255))
+        painter._scenery.draw(surface, 1)
+        seen.append(pygame.surfarray.array3d(surface))
+    np.testing.assert_array_equal(seen[0], seen[2])
+    np.testing.assert_array_equal(seen[1][:-7, 4:], seen[0][7:, :-4])
+
+
+def test_scenery_far_away_is_drawn_as_if_it_came_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scenery, "MOST_TILES", 10)
+    recording = rolling(seconds=2, speed=40)
+    painter = Painter(recording, SMALL_FRAME)
+    for step in range(recording.steps):
+        painter.surface(step)
+    assert len(painter._scenery._tiles) <= 10 + 2 * 5
+    for step in (recording.steps, 0):
+        np.testing.assert_array_equal(painter.frame(step), draw_frame(recording, step, SMALL_FRAME))
+
+
+@pytest.mark.parametrize("size", [(640, 360), (322, 182)])
+def test_colours_of_videos_are_those_of_frames(size: tuple[int, int]) -> None:
+    """A picture drawn in Cr, Y, Cb is the picture drawn in RGB and converted (BT.709), up to rounding."""
+    recording = rolling(seconds=1)
+    width, height = size
+    luma, cb, cr = (np.empty((height // n, width // n), np.uint8) for n in (1, 2, 2))
+    put_planes(Painter(recording, size, "a title", colours=ycbcr).surface(40), luma, cb, cr)
+    red, green, blue = np.moveaxis(draw_frame(recording, 40, size, "a title") / 255, -1, 0)
+    bright = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+    np.testing.assert_allclose(luma, 16 + 219 * bright, atol=3)
+    for plane, colour, reach in ((cb, blue, 1.8556), (cr, red, 1.5748)):
+        difference = (colour - bright) / reach
+        mean = difference.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
+        np.testing.assert_allclose(plane, 128 + 224 * mean, atol=3)
 
 
 # --- videos ---

@@ -43,7 +43,7 @@ FORMAT = 1
 FILM: dict[str, Any] = {
     "size": (480, 270),
     "fps": 20.0,
-    "crf": 30,
+    "crf": 34,
 }  # half a megabyte each: the report holds all of them
 
 

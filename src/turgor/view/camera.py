@@ -12,6 +12,7 @@ from turgor.recording import Recording
 BODY_SHARE = 1 / 3  # [1], the body's size at rest / the frame's height
 BODY_HEIGHT = 0.6  # [1], where the camera's centre lies, from the top of the frame
 CAMERA_SMOOTHING = (0.4, 0.7)  # [s], standard deviation of the Gaussian over the path in x and y
+SUBPIXELS = 3  # the frame moves over the world in steps of 1 / SUBPIXELS pixel: what stands still has 3 x 3 looks
 CAMERA_SLACK = 0.22  # [1], furthest that the body's centre gets from the camera's / the frame's size
 
 
@@ -24,13 +25,15 @@ class Camera(msgspec.Struct, frozen=True, eq=False):
 
     def pixels(self, step: int, points: np.ndarray) -> np.ndarray:
         """Pixels from the top left of the frame, shape [..., 2], for `points` [m] [..., 2]."""
-        middle = np.array([0.5, BODY_HEIGHT]) * self.size
-        return middle + (points - self.centre[step]) * (self.scale, -self.scale)
+        return np.array(self.origin(step)) / SUBPIXELS + points * (self.scale, -self.scale)
 
-    def view(self, step: int) -> tuple[float, float, float, float]:
-        """Left, right, lowest and highest coordinate in the frame [m]."""
-        (x, y), (width, height) = self.centre[step].tolist(), (n / self.scale for n in self.size)
-        return x - width / 2, x + width / 2, y - (1 - BODY_HEIGHT) * height, y + BODY_HEIGHT * height
+    def origin(self, step: int) -> tuple[int, int]:
+        """Where the world's origin lies, from the top left of the frame [px / SUBPIXELS]."""
+        (x, y), (width, height) = self.centre[step].tolist(), self.size
+        return (
+            round(SUBPIXELS * (0.5 * width - x * self.scale)),
+            round(SUBPIXELS * (BODY_HEIGHT * height + y * self.scale)),
+        )
 
     @property
     def spacing(self) -> float:

@@ -1,12 +1,11 @@
 """Frames: one picture of a `Recording` at one step, drawn in memory, without a window.
 
-A frame is made of coloured polygons in metres, back to front: ground, walls, gas, trail, springs and masses.
-The camera turns metres into pixels; text and colour bars are laid over the result.
+A frame is made of coloured polygons in metres, back to front: what stands still (`scenery.py`), gas, trail, springs
+and masses. The camera turns metres into pixels; text and colour bars are laid over the result.
 """
 
 from __future__ import annotations
 
-import math
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -15,40 +14,32 @@ import numpy as np
 
 from turgor.errors import InvalidInput, describe
 from turgor.recording import Recording
-from turgor.scene import highest_ground
-from turgor.view.camera import follow
+from turgor.view.camera import SUBPIXELS, follow
+from turgor.view.colours import Colour, Colours, premultiplied, rgb
+from turgor.view.scenery import Scenery
 from turgor.view.shapes import (
     INK,
     PRESSURE_MAP,
-    SOLID,
     STRAIN_MAP,
-    SURFACE,
-    Colour,
     Shape,
     body_shapes,
     centre_shapes,
-    ground_shapes,
     level,
     shade,
     span,
     strain,
     strain_range,
     trail_shapes,
-    visible_ground,
-    wall_shapes,
 )
 
 if TYPE_CHECKING:
     import pygame
 
 SMALLEST_SIZE, LARGEST_SIZE = 64, 8192  # [px]
-SUPERSAMPLING = 3  # polygons are drawn this many times larger, then averaged: smooth edges
 SPEED_WINDOW = 1.0  # [s]
 
 SKY_TOP, SKY_BOTTOM = (196, 217, 236), (246, 249, 251)
-GRID = (205, 217, 228)
 PANEL = (250, 252, 253, 190)
-TICK, TICK_TEXT = (146, 156, 171), (214, 220, 229)
 FAINT_INK = (92, 102, 116)
 
 
@@ -61,9 +52,10 @@ def draw_frame(recording: Recording, step: int, size: tuple[int, int] = (1280, 7
 
 
 class Painter:
-    """Draws the frames of one recording; holds what they share (camera, fonts, sky, colour bars).
+    """Draws the frames of one recording; holds what they share (camera, fonts, sky, scenery, colour bars).
 
-    `pressure_range` (low, high) [Pa] is what the gas's colours span; None: what the recording spans.
+    `pressure_range` (low, high) [Pa] is what the gas's colours span; None: what the recording spans. `colours` are
+    those that a picture holds: `rgb`, or for the encoder `ycbcr`.
     Raises `InvalidInput` for a size or a recording that cannot be drawn.
     """
 
@@ -74,6 +66,7 @@ class Painter:
         title: str = "",
         *,
         pressure_range: tuple[float, float] | None = None,
+        colours: Colours = rgb,
     ) -> None:
         self.recording = recording
         self.size = width, height = checked_size(size)
@@ -82,7 +75,7 @@ class Painter:
         self.title = title
         self.com = recording.com  # [m], shape [step + 1, 2]
         self.camera = follow(recording, self.com, self.size)
-        self.walls = wall_shapes(recording.scene)
+        self._colours = colours
         self.pressure_range = pressure_range or span(recording.pressure)  # [Pa]
         self.strain_range = strain_range(recording)  # [1]
         pygame = _pygame()
@@ -93,8 +86,7 @@ class Painter:
         self._sky = self._draw_sky()
         self._panel = self._draw_panel()
         self._bars = self._draw_bars()
-        self._labels: dict[float, pygame.Surface] = {}
-        self._heights: dict[float, float | None] = {}  # of the ground at x [m]
+        self._scenery = Scenery(recording.scene, self.camera, colours, self._small, self._zoom)
 
     def frame(self, step: int) -> np.ndarray:
         """The picture after `step` steps, uint8, shape [height, width, 3]."""
@@ -107,11 +99,7 @@ class Painter:
         if not 0 <= step <= self.recording.steps:
             raise InvalidInput(f"step: expected 0 to {self.recording.steps}", describe(step))
         self._surface.blit(self._sky, (0, 0))
-        self._draw_grid(step)
-        self._draw_ground(step)
-        for shape in self.walls:
-            self._fill(step, [shape])
-        self._draw_ruler(step)
+        self._scenery.draw(self._surface, step)
         self._draw_gas(step)
         self._fill(step, trail_shapes(self.recording, self.com, step))
         body = body_shapes(self.recording, step, self.strain_range)
@@ -132,12 +120,12 @@ class Painter:
             return
         extent = (high - low).astype(int)
         # made anew, transparent: measured, that is faster than to keep one for the largest extent and clear a part
-        canvas = pygame.Surface((SUPERSAMPLING * extent).tolist(), pygame.SRCALPHA, 32)
-        corners = (SUPERSAMPLING * (points - low)).tolist()
+        canvas = pygame.Surface((SUBPIXELS * extent).tolist(), pygame.SRCALPHA, 32)
+        corners = (SUBPIXELS * (points - low)).tolist()
         first = 0
         for colour, polygon in shapes:
             last = first + len(polygon)
-            pygame.draw.polygon(canvas, colour, corners[first:last])
+            pygame.draw.polygon(canvas, premultiplied(self._colours(colour)), corners[first:last])
             first = last
         # averaging over a transparent ground yields colours times alpha: premultiplied
         smooth = pygame.transform.smoothscale(canvas, extent.tolist())
@@ -146,50 +134,9 @@ class Painter:
     def _draw_sky(self) -> pygame.Surface:
         pygame = _pygame()
         column = pygame.Surface((1, 2), 0, 32)
-        column.set_at((0, 0), SKY_TOP)
-        column.set_at((0, 1), SKY_BOTTOM)
+        column.set_at((0, 0), self._colours(SKY_TOP))
+        column.set_at((0, 1), self._colours(SKY_BOTTOM))
         return pygame.transform.smoothscale(column, self.size)
-
-    def _draw_grid(self, step: int) -> None:
-        line = _pygame().draw.aaline
-        for _, x in self._marks(step, self.camera.spacing):
-            line(self._surface, GRID, (x, 0), (x, self.size[1]))
-
-    def _marks(self, step: int, spacing: float) -> list[tuple[float, float]]:
-        """(x [m], x [px]) of every multiple of `spacing` [m] in view."""
-        left, right, _, _ = self.camera.view(step)
-        metres = spacing * np.arange(math.ceil(left / spacing), math.floor(right / spacing) + 1)
-        pixels = (metres - left) * self.camera.scale
-        return list(zip(metres.tolist(), pixels.tolist(), strict=True))
-
-    def _draw_ground(self, step: int) -> None:
-        left, right, low, _ = self.camera.view(step)
-        ground = visible_ground(self.recording.scene, left, right)
-        if not ground:
-            return
-        bottom = max(min(y for x1, y1, x2, y2 in ground for y in (y1, y2)), low) - 2 * SURFACE
-        # smooth edges where there are edges, plain rectangles below
-        self._fill(step, ground_shapes(ground, bottom))
-        top = math.ceil(self.camera.pixels(step, np.array([left, bottom]))[1]) - 1
-        for x1, _, x2, _ in ground:
-            a, b = ((x - left) * self.camera.scale for x in (x1, x2))
-            self._surface.fill(SOLID, (math.floor(a), top, math.ceil(b) - math.floor(a), self.size[1]))
-
-    def _draw_ruler(self, step: int) -> None:
-        """Ticks in the ground, with metres."""
-        line, spacing, zoom = _pygame().draw.aaline, self.camera.spacing, self._zoom
-        minor = spacing / (10 if spacing * self.camera.scale >= 80 else 5)
-        _, _, low, _ = self.camera.view(step)
-        for metres, x in self._marks(step, minor):
-            height = self._height(metres)
-            if height is None:
-                continue
-            labelled = round(metres / minor) % round(spacing / minor) == 0
-            top = self.size[1] - (height - low) * self.camera.scale + 5 * zoom
-            line(self._surface, TICK, (x, top), (x, top + (12 if labelled else 4) * zoom))
-            if labelled:
-                label = self._label(metres)
-                self._surface.blit(label, (round(x - label.get_width() / 2), round(top + 15 * zoom)))
 
     def _draw_gas(self, step: int) -> None:
         """The chambers, straight onto the frame: springs hide their edges, and nothing shines through."""
@@ -197,38 +144,29 @@ class Painter:
         levels = level(self.recording.pressure[step], self.pressure_range)
         for share, loop in zip(levels, self.recording.body.chambers, strict=True):
             corners = position[list(loop)].tolist()
-            _pygame().draw.polygon(self._surface, shade(PRESSURE_MAP, share), corners)
+            _pygame().draw.polygon(self._surface, self._colours(shade(PRESSURE_MAP, share)), corners)
 
-    def _height(self, x: float) -> float | None:
-        """Height of the ground at x [m]; None: there is none."""
-        if x not in self._heights:
-            scene = self.recording.scene
-            self._heights[x] = highest_ground(scene, x, x) if visible_ground(scene, x, x) else None
-        return self._heights[x]
-
-    def _label(self, metres: float) -> pygame.Surface:
-        if metres not in self._labels:
-            self._labels[metres] = self._small.render(_minus(f"{metres:g} m"), True, TICK_TEXT)
-        return self._labels[metres]
+    def _write(self, font: Any, text: str, colour: Colour) -> pygame.Surface:
+        return font.render(text.replace("-", "−"), True, self._colours(colour))
 
     def _draw_panel(self) -> pygame.Surface:
         """The title and the names of the readings, for the top left corner."""
         zoom, line = self._zoom, 25 * self._zoom
-        title = self._bold.render(self.title, True, INK)
+        title = self._write(self._bold, self.title, INK)
         top = 10 * zoom + (1.15 * line if self.title else 0)
-        remark = self._small.render(f"mean of the last {SPEED_WINDOW:g} s", True, FAINT_INK)
+        remark = self._write(self._small, f"mean of the last {SPEED_WINDOW:g} s", FAINT_INK)
         width = max(title.get_width() + 28 * zoom, 206 * zoom + remark.get_width() + 12 * zoom)
         panel = self._blank_panel((width, top + 3 * line + 8 * zoom))
         panel.blit(title, (14 * zoom, 9 * zoom))
         for row, name in enumerate(("time", "distance", "speed")):
-            panel.blit(self._text.render(name, True, FAINT_INK), (14 * zoom, top + row * line))
+            panel.blit(self._write(self._text, name, FAINT_INK), (14 * zoom, top + row * line))
         panel.blit(remark, (206 * zoom, top + 2 * line + 3 * zoom))
         return panel
 
     def _blank_panel(self, extent: tuple[float, float]) -> pygame.Surface:
         pygame = _pygame()
         panel = pygame.Surface((round(extent[0]), round(extent[1])), pygame.SRCALPHA, 32)
-        pygame.draw.rect(panel, PANEL, panel.get_rect(), border_radius=round(8 * self._zoom))
+        pygame.draw.rect(panel, self._colours(PANEL), panel.get_rect(), border_radius=round(8 * self._zoom))
         return panel
 
     def _draw_readings(self, step: int) -> None:
@@ -238,7 +176,7 @@ class Painter:
         top = margin + 10 * zoom + (1.15 * line if self.title else 0)
         time, distance, speed = readings(self.recording, self.com, step)
         for row, value in enumerate((f"{time:.2f} s", f"{distance:.1f} m", f"{speed:.2f} m/s")):
-            number = self._text.render(_minus(value), True, INK)
+            number = self._write(self._text, value, INK)
             self._surface.blit(number, (margin + 196 * zoom - number.get_width(), top + row * line))
 
     def _draw_bars(self) -> list[Bar]:
@@ -265,19 +203,19 @@ class Painter:
         pygame, zoom = _pygame(), self._zoom
         picture = self._blank_panel((width, 62 * zoom))
         bar = bar_place(width, zoom)
-        label = self._small.render(name, True, INK)
+        label = self._write(self._small, name, INK)
         picture.blit(label, ((width - label.get_width()) / 2, 5 * zoom))
         for x in range(bar[2]):
-            picture.fill(shade(colours, x / (bar[2] - 1)), (bar[0] + x, bar[1], 1, bar[3]))
-        pygame.draw.rect(picture, FAINT_INK, (bar[0] - 1, bar[1] - 1, bar[2] + 2, bar[3] + 2), 1)
+            picture.fill(self._colours(shade(colours, x / (bar[2] - 1))), (bar[0] + x, bar[1], 1, bar[3]))
+        pygame.draw.rect(picture, self._colours(FAINT_INK), (bar[0] - 1, bar[1] - 1, bar[2] + 2, bar[3] + 2), 1)
         for side, text in enumerate(ends):
-            end = self._small.render(_minus(text), True, FAINT_INK)
+            end = self._write(self._small, text, FAINT_INK)
             picture.blit(end, (bar[0] + side * (bar[2] - end.get_width()), bar[1] + bar[3] + 7 * zoom))
         return picture
 
     def _draw_pointers(self, step: int) -> None:
         """The colour bars, with a triangle beneath each present value."""
-        polygon, size = _pygame().draw.polygon, max(round(5 * self._zoom), 3)
+        polygon, ink, size = _pygame().draw.polygon, self._colours(INK), max(round(5 * self._zoom), 3)
         for bar in self._bars:
             self._surface.blit(bar.picture, bar.corner)
             left, top, width, height = bar_place(bar.picture.get_width(), self._zoom)
@@ -285,7 +223,7 @@ class Painter:
             y = bar.corner[1] + top + height + 2
             for value in level(values, bar.limits):
                 x = bar.corner[0] + left + round(value * (width - 1))
-                polygon(self._surface, INK, [(x, y), (x - size, y + size), (x + size, y + size)])
+                polygon(self._surface, ink, [(x, y), (x - size, y + size), (x + size, y + size)])
 
 
 class Bar(msgspec.Struct, frozen=True, eq=False):
@@ -339,7 +277,3 @@ def _font(name: str, size: float) -> Any:
     font = _pygame().font
     font.init()
     return font.Font(f"{matplotlib.get_data_path()}/fonts/ttf/{name}.ttf", round(size))
-
-
-def _minus(text: str) -> str:
-    return text.replace("-", "−")

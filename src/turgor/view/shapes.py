@@ -8,8 +8,8 @@ import numpy as np
 
 from turgor.recording import Recording
 from turgor.scene import Scene, highest_ground
+from turgor.view.colours import Colour
 
-Colour = tuple[int, ...]  # red, green, blue (, alpha), 0 to 255
 Shape = tuple[Colour, np.ndarray]  # a filled polygon: its colour, its corners [m], shape [corner, 2]
 
 TRAIL_LENGTH = 8.0  # [s]
@@ -124,10 +124,9 @@ def trail_shapes(recording: Recording, com: np.ndarray, step: int) -> list[Shape
     if len(steps) < 2:
         return []
     age = (step - steps[1:]) * recording.dt / TRAIL_LENGTH
-    alpha = (0.55 * np.clip(1 - age, 0, 1) ** 1.5)[:, None]
-    colours = (alpha * (*TRAIL, 255)).astype(int).tolist()
+    colours = [(*TRAIL, alpha) for alpha in (0.55 * 255 * np.clip(1 - age, 0, 1) ** 1.5).astype(int).tolist()]
     path = thick_lines(com[steps[:-1]], com[steps[1:]], 0.03 * recording.body.radius)
-    return list(zip(map(tuple, colours), path, strict=True))
+    return list(zip(colours, path, strict=True))
 
 
 def body_shapes(recording: Recording, step: int, strain_range: tuple[float, float]) -> list[Shape]:
