@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from turgor.arrays import as_numbers
 from turgor.body import Body
 from turgor.control import check_theta, observation_count, output_count
-from turgor.errors import InvalidInput, describe
+from turgor.errors import InvalidInput, describe, one_of
 from turgor.physics.batch import Batch, World, load_kernel
 from turgor.physics.memory import BYTES, MOST_BYTES, MOST_TRACE_BYTES, check_memory
 from turgor.physics.model import COMMANDS, CONTROLLER, REPLAY, WIDTH
@@ -25,6 +25,10 @@ from turgor.rollout import Rollout, cut_evenly, judge, starts_of
 from turgor.scene import Scene
 from turgor.task import Physics, Task, given_rows, start_position
 
+if TYPE_CHECKING:
+    from turgor.physics.gpu import Gpu
+
+DEVICES = ("cpu", "cuda")
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
 MOST_THREADS = 1024
 LARGEST_PUSH = 1e9  # [m/s]
@@ -54,19 +58,25 @@ class Step(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 class Simulator:
     """Runs agents of one `Task`. What an agent does depends neither on the batch it is in nor on `threads`."""
 
-    def __init__(self, task: Task, *, threads: int | None = None) -> None:
-        """`threads`: None for all cores. Raises `InvalidInput` for fewer than 1."""
+    def __init__(self, task: Task, *, threads: int | None = None, device: str = "cpu") -> None:
+        """`threads`: None for all cores. `device`: "cpu", or "cuda" for the first NVIDIA GPU, which runs whole tasks
+        (`rollout`, `record`) of large batches. Raises `InvalidInput` for fewer than 1 thread, or without such a GPU."""
         if threads is not None and (not isinstance(threads, int) or not 1 <= threads <= MOST_THREADS):
             raise InvalidInput(f"threads: expected a whole number, 1 to {MOST_THREADS}", describe(threads))
         self.task = task
         self.threads = threads or available_cores()
-        self._world = World(task)
+        if not isinstance(device, str) or device not in DEVICES:
+            raise one_of("device", DEVICES, device)
+        self.device = device
+        self._gpu = open_gpu() if device == "cuda" else None
+        self._world = World(task) if self._gpu is None else self._gpu.world(task)
         self._stepping: list[tuple[Batch, slice]] = []  # the agents that `step` drives, in parts
         stand = self._world.kernel.stand
         self._columns = [(name, *place) for name, place in stand.items() if name in Step.__struct_fields__]
 
     def __repr__(self) -> str:
-        return f"Simulator({self.task}, threads={self.threads})"
+        where = f"threads={self.threads}" if self._gpu is None else f"device={self.device!r}"
+        return f"Simulator({self.task}, {where})"
 
     def rollout(self, theta: ArrayLike, position: ArrayLike | None = None) -> Rollout:
         """A `Rollout` of every row of `theta` [agent, parameter] from the task's start, or from `position` [m],
@@ -79,7 +89,7 @@ class Simulator:
     def rollout_in(self, tasks: Sequence[Task], theta: ArrayLike) -> list[Rollout]:
         """A `Rollout` of `theta` [agent, parameter] in each of `tasks`, with the bits that a simulator of each would
         have, and the threads spread over all of them at once. Raises `InvalidInput`."""
-        works = [_Work(Simulator(task, threads=self.threads), theta) for task in tasks]
+        works = [_Work(Simulator(task, threads=self.threads, device=self.device), theta) for task in tasks]
         self._spread(lambda one: one[0].run(one[1]), [(work, part) for work in works for part in work.parts])
         return [work.rollout() for work in works]
 
@@ -99,7 +109,7 @@ class Simulator:
         theta = np.reshape(as_numbers("theta", theta), (1, -1))
         theta = check_theta(theta, self.task.body, self.task.condition, self.task.controller)
         starts = starts_of(self.task, 1, None if position is None else as_numbers("position", position)[None])
-        batch = Batch(self._world, starts)
+        batch = self._batch(starts)
         batch.think(theta)
         trace = batch.trace(self.task.steps)
         final, steps, solved = self._run_whole(batch, trace)
@@ -111,6 +121,8 @@ class Simulator:
         [agent, mass, 2], in place of the task's; `scenes` [agent]: one for each in place of the task's."""
         if not isinstance(agents, int) or agents < 1:
             raise InvalidInput("agents: expected a whole number, at least 1", describe(agents))
+        if self._gpu is not None:
+            raise InvalidInput("reset: expected a simulator of device 'cpu': a GPU runs whole tasks", repr(self.device))
         starts = starts_of(self.task, agents, position)
         if scenes is not None and len(scenes) != agents:
             raise InvalidInput(f"scenes: expected one for each of {agents} agents", str(len(scenes)))
@@ -207,6 +219,10 @@ class Simulator:
             raise InvalidInput(f"out: expected a Step of these {agents} agents", f"{len(out.observation)} agents")
         return out
 
+    def _batch(self, starts: np.ndarray) -> Batch:
+        """Agents that are to begin at `starts` [agent, mass, 2]."""
+        return Batch(self._world, starts) if self._gpu is None else self._gpu.batch(self._world, starts)
+
     def _run_whole(self, batch: Batch, trace: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Final positions, steps and solved of a batch that runs the whole task."""
         task = self.task
@@ -256,6 +272,10 @@ class Simulator:
 
     def _spread(self, run: Callable[[Any], None], parts: list[Any]) -> None:
         """Runs every part, over the threads, of which the caller's is one."""
+        if self._gpu is not None:
+            for part in parts:
+                run(part)
+            return
         load_kernel()
         todo = deque(parts)
 
@@ -287,11 +307,14 @@ class _Work:
         self._final = np.empty(self._starts.shape, dtype=np.float32)
         self._steps = np.empty(agents, dtype=np.int64)
         self._solved = np.empty(agents, dtype=bool)
+        if simulator._gpu is not None:
+            self.parts = cut_evenly(agents, -(-agents // simulator._gpu.agents_at_once(world)))
+            return
         most = max(1, min(BLOCKS_AT_ONCE, MOST_BYTES // world.kernel.block_bytes))
         self.parts = _parts(agents, simulator.threads, most)
 
     def run(self, part: slice) -> None:
-        batch = Batch(self._simulator._world, self._starts[part])
+        batch = self._simulator._batch(self._starts[part])
         batch.think(self._theta[part])
         self._final[part], self._steps[part], self._solved[part] = self._simulator._run_whole(batch)
 
@@ -373,6 +396,13 @@ def perturbed(position: np.ndarray, repeats: int, size: float = 1e-6) -> np.ndar
         moved = np.float32(here + np.float32(sign * size * (1 + k // (4 * n))))
         start[mass, axis] = moved if moved != here else np.nextafter(here, np.float32(sign * np.inf))
     return starts
+
+
+def open_gpu() -> Gpu:
+    """The first GPU of this machine. Raises `InvalidInput` without one."""
+    from turgor.physics.gpu import first_gpu
+
+    return first_gpu()
 
 
 def available_cores() -> int:

@@ -13,7 +13,19 @@ from turgor.control import pack
 from turgor.physics.engine import LASTING, PASSING, load, run_blocks, words_of
 from turgor.physics.ground import Columns, Room, cut_into_columns, reach_of, room_for
 from turgor.physics.memory import BYTES, LINE, MOST_TRACE_BYTES, aligned, check_memory, fields
-from turgor.physics.model import COMMANDS, CONTROLLER, UNKNOWN, WIDTH, Brain, Ground, Result, State, Work
+from turgor.physics.model import (
+    COMMANDS,
+    CONTROLLER,
+    ON_CPU,
+    UNKNOWN,
+    WIDTH,
+    Block,
+    Brain,
+    Ground,
+    Result,
+    State,
+    Work,
+)
 from turgor.physics.tables import ground_tables, make_kernel, write_ground
 from turgor.scene import Scene
 from turgor.task import Task
@@ -28,10 +40,10 @@ _SPARE = 0.15  # room for scenes that are a little larger than those seen
 class World:
     """A task as the kernel sees it, with its one scene: what the batches of a simulator share."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, block: Block = ON_CPU) -> None:
         self.task = task
         columns = self.cut(task.scene)
-        self.kernel = make_kernel(task, room_for([columns]))
+        self.kernel = make_kernel(task, room_for([columns]), block=block)
         self.grounds = aligned(1, self.kernel.size(Ground))
         write_ground(ground_tables(self.kernel, self.grounds[0]), columns)
 
@@ -59,14 +71,17 @@ class Batch:
         else:
             self._make_room(room_for(self._scenes, _SPARE))
             self._write_scenes(range(self.agents))
-        self.memory = aligned(self.blocks, self.kernel.size(State))
+        self._make_memory()
         self.brains = aligned(self.blocks, self.kernel.size(Brain))
         self.results = aligned(self.blocks, self.kernel.size(Result))
         self._told: tuple[Sequence[Any], list[int]] = [None], []  # the last arrays, and where they are
 
+    def _make_memory(self) -> None:
+        self.memory = aligned(self.blocks, self.kernel.size(State))
+
     @property
     def blocks(self) -> int:
-        return -(-self.agents // WIDTH)
+        return -(-self.agents // self.kernel.block.abreast)
 
     @property
     def own_scenes(self) -> bool:
@@ -74,20 +89,20 @@ class Batch:
 
     def think(self, theta: np.ndarray) -> None:
         """Gives the agents their controllers, `theta` [agent, parameter]."""
-        task = self._task
+        task, abreast = self._task, self.kernel.block.abreast
         weights, biases = pack(theta, task.body, task.condition, task.controller, task.physics.dt)
-        lanes = np.minimum(np.arange(self.blocks * WIDTH), self.agents - 1)  # the last agent in lanes left over
-        for brain, agents in zip(self.brains, lanes.reshape(-1, WIDTH), strict=True):
+        lanes = np.minimum(np.arange(self.blocks * abreast), self.agents - 1)  # the last agent in lanes left over
+        for brain, agents in zip(self.brains, lanes.reshape(-1, abreast), strict=True):
             self.kernel.field(brain, Brain, "weight")[:] = weights[agents].T
             self.kernel.field(brain, Brain, "bias")[:] = biases[agents].T
 
     def trace(self, steps: int) -> np.ndarray:
         """Room for a recording of the first block, float32 [step + 1, row, lane]. Raises `InvalidInput` for more steps
         than can be recorded."""
-        body = self.kernel.lengths
+        body, abreast = self.kernel.lengths, self.kernel.block.abreast
         row = 5 * body["mass"] + body["spring"] + body["chamber"] + body["input"]
-        check_memory("steps: expected fewer to be recorded", BYTES * WIDTH * row * (steps + 1), MOST_TRACE_BYTES)
-        return aligned(steps + 1, row * WIDTH).reshape(steps + 1, row, WIDTH)
+        check_memory("steps: expected fewer to be recorded", BYTES * abreast * row * (steps + 1), MOST_TRACE_BYTES)
+        return aligned(steps + 1, row * abreast).reshape(steps + 1, row, abreast)
 
     def run(
         self,
@@ -110,15 +125,18 @@ class Batch:
         """
         scripts = _NO_SCRIPT
         if script is not None:
-            scripts = aligned(1, script.size * WIDTH)
-            scripts[0] = np.repeat(script.ravel(), WIDTH)
+            scripts = aligned(1, script.size * self.kernel.block.abreast)
+            scripts[0] = np.repeat(script.ravel(), self.kernel.block.abreast)
         traces = _NO_TRACE
         if trace is not None:
             assert trace.ctypes.data % LINE == 0  # the kernel moves whole cache lines
             traces = trace.reshape(1, -1)
-        words = words_of((scripts, traces, fresh, commands, observations, stands), PASSING)
-        run_blocks([*self._lasting(), *words, drive, self.steps, steps, last])
+        self._call((scripts, traces, fresh, commands, observations, stands), (drive, self.steps, steps, last))
         self.steps += steps
+
+    def _call(self, passing: Sequence[np.ndarray], counts: Sequence[int]) -> None:
+        """Calls the kernel with arrays that are PASSING, and COUNTS."""
+        run_blocks([*self._lasting(), *words_of(passing, PASSING), *counts])
 
     def _lasting(self) -> list[int]:
         """The words of the arrays that stay from call to call."""

@@ -8,21 +8,28 @@ literals, array expressions, rewrites).
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import llvmlite.binding as llvm
 from llvmlite import ir
 from numba import njit, types
-from numba.core import compiler, typed_passes, untyped_passes
+from numba.core import cgutils, compiler, typed_passes, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.cpu import _dynfunc
 from numba.np.arrayobj import populate_array
 from numba.np.numpy_support import from_dtype
 
-from turgor.physics.engine import ENTRY, target_machine
+from turgor.errors import InvalidInput
+from turgor.physics.engine import ENTRY, THREADS, target_machine, words_in
+
+WORD = ir.IntType(64)
+THREAD = "thread"  # an argument: its number
+GPU = "nvptx64-nvidia-cuda"
+OLDEST_GPU = "sm_70"  # of 2017
+GLOBAL = 1  # the space of addresses where a GPU's memory is
+BLOCKS = 4  # of THREADS at once on a multiprocessor: at most 128 registers a thread
 
 
 class Part(JITCodeLibrary):
@@ -146,22 +153,27 @@ shared = njit(forceinline=False, **_options)
 
 def machine_code(kernel: Any, arguments: Sequence[Any]) -> bytes:
     """An object file with the function ENTRY(words), which calls the stage `kernel` with `arguments`: types, for arrays
-    a pair (dtype, dimensions). What stands in `words` is told by `engine.words_of`."""
+    a pair (dtype, dimensions), or (dtype, shape) for one that lies in the words. What else stands there is told by
+    `engine.words_of`."""
     return target_machine().emit_object(optimised(kernel, arguments))
 
 
-def optimised(kernel: Any, arguments: Sequence[Any]) -> Any:
-    """The kernel as one LLVM module, ready to be made machine code of."""
-    wanted = tuple(types.Array(from_dtype(a[0]), a[1], "C") if isinstance(a, tuple) else a for a in arguments)
+def optimised(kernel: Any, arguments: Sequence[Any], machine: Any = None) -> Any:
+    """The kernel as one LLVM module, ready to be made machine code of for this processor or another `machine`."""
+    machine = machine or target_machine()
+    on_gpu = machine.triple == GPU
+    wanted = tuple(map(_numba_type, arguments))
     kernel.compile(wanted)
     part = kernel.overloads[wanted]
     module = part.library._get_module_for_linking().clone()
-    module.link_in(llvm.parse_assembly(str(_entry(part, wanted))))
+    module.link_in(llvm.parse_assembly(str(_entry(part, arguments, on_gpu))))
     module.verify()
     for symbol in (*module.functions, *module.global_variables):
         if not symbol.is_declaration and symbol.name != ENTRY:
             symbol.linkage = "internal"
-    machine = target_machine()
+            if on_gpu and symbol.is_function:
+                symbol.add_function_attribute("alwaysinline")
+    module.triple = machine.triple
     module.data_layout = str(machine.target_data)
     # the lanes are the vectors, and their operations long enough without unrolling; level 3 is no faster
     options = llvm.create_pipeline_tuning_options(speed_level=2)
@@ -175,33 +187,106 @@ def optimised(kernel: Any, arguments: Sequence[Any]) -> Any:
     return module
 
 
-def _entry(part: Any, wanted: Sequence[types.Type]) -> ir.Module:
+def _numba_type(argument: Any) -> types.Type:
+    if argument == THREAD:
+        return types.int64
+    if not isinstance(argument, tuple):
+        return argument
+    dtype, shape = argument
+    return types.Array(from_dtype(dtype), shape if isinstance(shape, int) else len(shape), "C")
+
+
+def _entry(part: Any, arguments: Sequence[Any], on_gpu: bool) -> ir.Module:
     """The function ENTRY."""
     context, description = part.target_context, part.fndesc
     module = context.codegen()._create_empty_module(ENTRY)
-    word = ir.IntType(64)
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [word.as_pointer()]), ENTRY)
+    argument_type = ir.ArrayType(WORD, 0) if on_gpu else WORD
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [argument_type.as_pointer()]), ENTRY)
     builder = ir.IRBuilder(function.append_basic_block())
-    at = itertools.count()
+    words = builder.bitcast(function.args[0], WORD.as_pointer())
+    taken = 0
 
-    def take() -> ir.Value:
-        return builder.load(builder.gep(function.args[0], [word(next(at))]))
+    def take(count: int = 1) -> ir.Value:
+        nonlocal taken
+        taken += count
+        return builder.gep(words, [WORD(taken - count)])
 
     values = []
-    for kind in wanted:
+    for argument in arguments:
+        kind = _numba_type(argument)
         if isinstance(kind, types.Array):
-            array = context.make_array(kind)(context, builder)
-            data = builder.inttoptr(take(), array.data.type)
-            shape = [take() for _ in range(kind.ndim)]
-            size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
-            strides: list[ir.Value] = [word(size)]
-            for length in reversed(shape[1:]):
-                strides.insert(0, builder.mul(strides[0], length))
-            populate_array(array, data, shape, strides, size, None)
-            values.append(array._getvalue())
+            values.append(_array(context, builder, kind, argument[1], take, on_gpu))
+        elif argument == THREAD and on_gpu:
+            values.append(_thread_number(builder))
+        elif isinstance(kind, types.Integer):
+            values.append(builder.load(take()))
         else:
-            values.append(take() if isinstance(kind, types.Integer) else context.get_dummy_value())
+            values.append(context.get_dummy_value())
+    if on_gpu:
+        _make_gpu_kernel(function, taken)
     callee = context.declare_function(module, description)
     context.call_conv.call_function(builder, callee, description.restype, description.argtypes, values)
     builder.ret_void()
     return module
+
+
+def _array(context: Any, builder: Any, kind: Any, shape: Any, take: Callable[..., ir.Value], on_gpu: bool) -> ir.Value:
+    """An array as Numba has it, from words: its address and shape, or all of it where its `shape` is given."""
+    array = context.make_array(kind)(context, builder)
+    size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
+    if isinstance(shape, int):
+        address = builder.load(take())
+        lengths = [builder.load(take()) for _ in range(shape)]
+        data = builder.inttoptr(address, array.data.type.pointee.as_pointer(GLOBAL if on_gpu else 0))
+        data = builder.addrspacecast(data, array.data.type) if on_gpu else data
+    else:
+        lengths = [WORD(length) for length in shape]
+        data = builder.bitcast(take(words_in(shape, size)), array.data.type)
+    strides: list[ir.Value] = [WORD(size)]
+    for length in reversed(lengths[1:]):
+        strides.insert(0, builder.mul(strides[0], length))
+    populate_array(array, data, lengths, strides, size, None)
+    return array._getvalue()
+
+
+# --- on a GPU -----------------------------------------------------------------------------------------------------
+
+
+def ptx(kernel: Any, arguments: Sequence[Any], architecture: str = OLDEST_GPU) -> str:
+    """The same as `machine_code` for NVIDIA GPUs of an `architecture` or newer: text that their driver makes machine
+    code of. The words themselves are what the kernel is launched with; a THREAD is the thread's number. Raises
+    `InvalidInput` where llvmlite was built without such GPUs."""
+    machine = _gpu_machine(architecture)
+    return machine.emit_assembly(optimised(kernel, arguments, machine))
+
+
+def _gpu_machine(architecture: str) -> Any:
+    """LLVM's description of a GPU. Every operation is rounded as IEEE 754 has it, one by one, as by default."""
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    try:
+        target = llvm.Target.from_triple(GPU)
+    except RuntimeError as error:
+        raise InvalidInput("device: expected an llvmlite that knows NVIDIA's GPUs, as on PyPI", str(error)) from None
+    return target.create_target_machine(cpu=architecture, opt=3)
+
+
+def _make_gpu_kernel(function: ir.Function, words: int) -> None:
+    """Says that GPUs launch it, that `words` are its argument, and for how many threads it is."""
+    function.calling_convention = "ptx_kernel"
+    function.args[0].type = ir.ArrayType(WORD, words).as_pointer()
+    function.args[0].add_attribute("byval")
+    number = ir.IntType(32)
+    bounds = [function, "maxntidx", number(THREADS), "minctasm", number(BLOCKS)]
+    function.module.add_named_metadata("nvvm.annotations", function.module.add_metadata(bounds))
+
+
+def _thread_number(builder: ir.IRBuilder) -> ir.Value:
+    """The number of this thread among all."""
+
+    def ask(name: str) -> ir.Value:
+        kind = ir.FunctionType(ir.IntType(32), [])
+        asked = cgutils.get_or_insert_function(builder.module, kind, f"llvm.nvvm.read.ptx.sreg.{name}.x")
+        return builder.zext(builder.call(asked, []), WORD)
+
+    return builder.add(builder.mul(ask("ctaid"), WORD(THREADS)), ask("tid"))

@@ -1,4 +1,5 @@
-"""The kernel's machine code: from its file, or made by `build.py`, which alone needs Numba and takes some seconds.
+"""The kernel's machine code: from its file, or made by `build.py`, which alone needs Numba and takes some seconds. What
+GPUs are given (PTX) is kept in the same way.
 
 The file is known by the sources of the engine, the processor and LLVM, so that it is never older than what it was made
 from. It lies where Numba would have put it: in the folder NUMBA_CACHE_DIR if that is set, else beside the sources, else
@@ -11,6 +12,7 @@ import contextlib
 import ctypes
 import gc
 import hashlib
+import math
 import os
 import struct
 import threading
@@ -23,7 +25,11 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
+from turgor.errors import InvalidInput, describe
+
 ENTRY = "turgor_run_blocks"
+KERNEL, PTX = "kernel", "ptx"  # what a file holds: machine code for this processor, or what is made for GPUs
+THREADS = 128  # of a block of a GPU's grid
 DIGEST = 32  # [byte], the checksum before the machine code
 # The arguments of `step.run_blocks`: arrays in C order, type and dimensions of each. Those of a batch ...
 LASTING = {
@@ -46,6 +52,7 @@ PASSING = {  # ... those of one call ...
     "stands": (np.float32, 2),
 }
 COUNTS = ("drive", "first_step", "steps", "last_step")  # ... and whole numbers
+WORD_BYTES = 8  # of an address or a whole number
 
 _sources = Path(__file__).parent
 _loading = threading.Lock()
@@ -62,6 +69,16 @@ def words_of(arrays: Iterable[np.ndarray], kinds: Mapping[str, tuple[type, int]]
     return words
 
 
+def in_words(array: np.ndarray) -> bytes:
+    """An array that lies among the words."""
+    return array.tobytes().ljust(WORD_BYTES * words_in(array.shape, array.itemsize), b"\0")
+
+
+def words_in(shape: Sequence[int], size: int) -> int:
+    """The words that an array of numbers of `size` bytes takes, where it lies among them."""
+    return -(-math.prod(shape) * size // WORD_BYTES)
+
+
 def run_blocks(words: Sequence[int]) -> None:
     """Calls `step.run_blocks` with `words_of` LASTING and PASSING arrays, and COUNTS. Meanwhile other threads run."""
     if not _loaded:
@@ -73,33 +90,65 @@ _WORDS = struct.Struct(f"{sum(1 + n for _, n in (LASTING | PASSING).values()) + 
 
 
 def load(before_making: Callable[[], object] = lambda: None) -> None:
-    """Has the machine code in memory; calls `before_making` if it has to be made."""
+    """Has the machine code in memory; calls `before_making` if it has to be made. Raises `InvalidInput` where the
+    installed Numba cannot make it."""
     with _loading:
         if _loaded:
             return
-        code = _found()
-        if code is None:
-            before_making()
-            code = _made()
-            _keep(code)
-        compiled = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine())
-        compiled.add_object_file(llvm.ObjectFileRef.from_data(code))
-        compiled.finalize_object()
-        function = ctypes.CFUNCTYPE(None, ctypes.c_char_p)(compiled.get_function_address(ENTRY))
-        _loaded.extend([function, compiled])
+        _loaded.extend(function_of(code_of(KERNEL, before_making)))
 
 
-def _made() -> bytes:
+def function_of(code: bytes) -> tuple[Any, Any]:
+    """The function ENTRY of machine code, to be called with words, and what it lives in."""
+    compiled = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine())
+    compiled.add_object_file(llvm.ObjectFileRef.from_data(code))
+    compiled.finalize_object()
+    return ctypes.CFUNCTYPE(None, ctypes.c_char_p)(compiled.get_function_address(ENTRY)), compiled
+
+
+def code_of(kind: str, before_making: Callable[[], object]) -> bytes:
+    """The machine code of the KERNEL, or PTX; calls `before_making` if it has to be made."""
+    code = _found(kind)
+    if code is None:
+        before_making()
+        code = _made(kind)
+        _keep(code, kind)
+    return code
+
+
+def _made(kind: str = KERNEL) -> bytes:
     collecting = gc.isenabled()
     gc.disable()  # Numba makes millions of objects that it keeps
     try:
-        from turgor.physics.build import machine_code
-        from turgor.physics.step import ARGUMENTS, run_blocks
+        from turgor.physics.build import machine_code, ptx
+        from turgor.physics.step import ARGUMENTS, THREAD_ARGUMENTS, run_agent, run_blocks
 
+        if kind == PTX:
+            return ptx(run_agent, THREAD_ARGUMENTS).encode()
         return machine_code(run_blocks, ARGUMENTS)
+    except Exception as error:
+        _blame_numba(error)
+        raise
     finally:
         if collecting:
             gc.enable()
+
+
+def _blame_numba(error: Exception) -> None:
+    """Raises `InvalidInput` where Numba cannot be imported, or is none of those that turgor allows."""
+    from importlib import metadata
+
+    from packaging.requirements import Requirement
+
+    try:
+        required = metadata.requires("turgor") or ()
+    except metadata.PackageNotFoundError:  # sources that are not installed: nobody has said what they need
+        return
+    allowed = next(r for r in map(Requirement, required) if r.name == "numba")
+    found = metadata.version("numba")
+    if isinstance(error, ImportError) or found not in allowed.specifier:
+        expected = f"expected {allowed} to make the engine with ('pip check' lists what does not fit)"
+        raise InvalidInput(expected, f"numba {found}: {describe(error)}") from error
 
 
 # --- the processor ------------------------------------------------------------------------------------------------
@@ -107,7 +156,8 @@ def _made() -> bytes:
 
 def processor() -> tuple[str, str]:
     """This processor's name and features as LLVM knows them, or those in NUMBA_CPU_NAME and NUMBA_CPU_FEATURES."""
-    name, features = os.environ.get("NUMBA_CPU_NAME"), os.environ.get("NUMBA_CPU_FEATURES")
+    name = os.environ.get("NUMBA_CPU_NAME")
+    features = os.environ.get("NUMBA_CPU_FEATURES", "" if name == "generic" else None)
     if features is None:
         try:
             features = llvm.get_host_cpu_features().flatten()
@@ -143,33 +193,39 @@ def _folders() -> list[Path]:
 
 
 @cache
-def _name() -> str:
+def _name(kind: str = KERNEL) -> str:
     """The file's name: which sources of which folder, for which processor."""
     where = "\n".join([str(_sources), *processor(), llvm.get_process_triple(), llvmlite.__version__])
     what = b"".join(source.read_bytes() for source in sorted(_sources.glob("*.py")))
-    return f"kernel-{hashlib.sha256(where.encode()).hexdigest()[:12]}-{hashlib.sha256(what).hexdigest()[:12]}"
+    return f"{kind}-{hashlib.sha256(where.encode()).hexdigest()[:12]}-{hashlib.sha256(what).hexdigest()[:12]}"
 
 
-def _found() -> bytes | None:
+def _found(kind: str = KERNEL) -> bytes | None:
     """What the file holds, if there is one that is whole."""
     for folder in _folders():
         with contextlib.suppress(OSError):
-            data = (folder / _name()).read_bytes()
+            data = (folder / _name(kind)).read_bytes()
             digest, code = data[:DIGEST], data[DIGEST:]
             if hashlib.sha256(code).digest() == digest:
                 return code
     return None
 
 
-def _keep(code: bytes) -> None:
+def _keep(code: bytes, kind: str = KERNEL) -> None:
     """Writes the file into the first folder that takes it, and removes those of older sources there."""
     from turgor.files import NotWritten, write_whole
 
+    name = _name(kind)
     for folder in _folders():
         with contextlib.suppress(OSError, NotWritten):
             folder.mkdir(parents=True, exist_ok=True)
-            write_whole(folder / _name(), hashlib.sha256(code).digest() + code)
-            for file in folder.glob(f"{_name().rpartition('-')[0]}-*"):
-                if file.name != _name():
-                    file.unlink(missing_ok=True)
+            write_whole(folder / name, hashlib.sha256(code).digest() + code)
+            _remove_older(folder, name)
             return
+
+
+def _remove_older(folder: Path, name: str) -> None:
+    for file in folder.glob(f"{name.rpartition('-')[0]}-*"):
+        if file.name != name:
+            with contextlib.suppress(OSError):  # Windows keeps a file that another process reads
+                file.unlink()

@@ -44,7 +44,7 @@ SCALAR = {"float": types.float32, "int": types.int32, "mask": types.boolean}
 
 
 class Lanes(types.Type):
-    """`width` numbers of one kind ("float", "int" or "mask") as one value."""
+    """`width` numbers of one kind ("float", "int" or "mask") as one value: a vector, or a plain number of one lane."""
 
     def __init__(self, kind: str, width: int) -> None:
         self.kind, self.width = kind, width
@@ -58,8 +58,8 @@ class Lanes(types.Type):
         return None
 
     @property
-    def llvm(self) -> ir.VectorType:
-        return ir.VectorType(ELEMENT[self.kind], self.width)
+    def llvm(self) -> ir.Type:
+        return ELEMENT[self.kind] if self.width == 1 else ir.VectorType(ELEMENT[self.kind], self.width)
 
 
 @register_model(Lanes)
@@ -69,6 +69,8 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _splat(builder: ir.IRBuilder, value: Any, width: int) -> ir.Value:
+    if width == 1:
+        return value
     empty = ir.Constant(ir.VectorType(value.type, width), ir.Undefined)
     first = builder.insert_element(empty, value, ir.IntType(32)(0))
     return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(ir.IntType(32), width), [0] * width))
@@ -136,7 +138,8 @@ def _comparison(symbol: str) -> Callable[..., ir.Value]:
 def _llvm_function(name: str) -> Callable[..., ir.Value]:
     def emit(builder: Any, lanes: Lanes, *values: Any) -> Any:
         kind = ir.FunctionType(lanes.llvm, [lanes.llvm] * len(values))
-        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{lanes.width}f32")
+        suffix = "f32" if lanes.width == 1 else f"v{lanes.width}f32"
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.{suffix}")
         return builder.call(function, values)
 
     return emit
@@ -163,6 +166,8 @@ for _prefix in ("", "i"):
     _define(getattr(operator, _prefix + "or" + "_" * (not _prefix)), ("mask",), lambda b, lanes, x, y: b.or_(x, y))
 _define(operator.invert, ("mask",), lambda builder, lanes, a: builder.not_(a), arguments=1)
 # As the vector units do it: the second operand where the comparison does not hold, NaN included.
+# On ARM64 LLVM takes FMINNM for min(x, 0.0), which gives -0.0 for -0.0. Only the solver's `correction` has such a
+# minimum, and there the sign of 0 is lost in the next sum.
 _define(min, ("float",), lambda b, lanes, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
 _define(max, ("float",), lambda b, lanes, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))
 _define(abs, ("float",), _llvm_function("fabs"), arguments=1)
@@ -217,7 +222,7 @@ def highest(typingctx: Any, value: Any) -> Any:
             high = builder.shuffle_vector(best, best, ir.Constant(places, [*range(half, 2 * half)]))
             best = builder.select(builder.fcmp_ordered(">", low, high), low, high)
             half //= 2
-        return builder.extract_element(best, ir.IntType(32)(0))
+        return best if value.width == 1 else builder.extract_element(best, ir.IntType(32)(0))
 
     return types.float32(value), emit
 

@@ -62,12 +62,16 @@ def fields(views: type) -> dict[str, tuple[type, str]]:
     return {name: get_args(hints[name]) for name in views._fields}  # ty: ignore[missing-attribute]
 
 
-def layout(views: type, lengths: Mapping[str, int], width: int) -> np.ndarray:
-    """Offsets of the fields in a buffer of float32 [4 byte], and at the end its size; each on a cache line."""
+def layout(views: type, lengths: Mapping[str, int], width: int, copies: int = 1) -> np.ndarray:
+    """Offsets of the fields in a buffer of float32 [4 byte], and at the end its size; each on a cache line.
+
+    Rows are `width` numbers wide. Of every number of a table there are `copies`, side by side: one for all lanes, or
+    one for each value of lanes.
+    """
     offsets, at = [], 0
     for annotation, length in fields(views).values():
         offsets.append(at)
-        size = lengths[length] * (width if FIELD[annotation][1] else 1)
+        size = lengths[length] * (width if FIELD[annotation][1] else copies)
         at += -(-size // (LINE // BYTES)) * (LINE // BYTES)
     return np.array([*offsets, at], dtype=np.int64)
 

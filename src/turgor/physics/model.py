@@ -12,6 +12,17 @@ import numpy as np
 from turgor.physics.memory import Floats, FloatTable, Ints, IntTable
 
 WIDTH = 16  # agents in a block: one AVX-512 vector; see ARCHITECTURE.md
+
+
+class Block(NamedTuple):
+    """How the agents of a block lie: so many `lanes` are one value, so many agents are `abreast` in memory."""
+
+    lanes: int
+    abreast: int
+
+
+ON_CPU = Block(WIDTH, WIDTH)
+ON_GPU = Block(1, 32)  # an agent a thread; what the 32 threads of a warp read is one cache line
 NOWHERE = -1
 UNKNOWN = -2  # a slot that has not been filled yet
 LOOK_AGAIN = 64  # [step], after which all pairs are looked at, so that `travel` gathers no rounding errors
@@ -201,6 +212,10 @@ class Work(NamedTuple):
     # springs, in the order of solving
     ux: Annotated[Floats, "spring"]  # unit vector from tail to head
     uy: Annotated[Floats, "spring"]
+    sx: Annotated[Floats, "spring"]  # the same, by the tail's mass [1/kg]
+    sy: Annotated[Floats, "spring"]
+    zx: Annotated[Floats, "spring"]  # by the head's
+    zy: Annotated[Floats, "spring"]
     link: Annotated[Floats, "spring"]  # how much of the impulse before it in the chain a spring takes on [1]
     bias: Annotated[Floats, "spring"]  # effective mass * bias velocity [N s]
     # commands: one per spring in (-1, 1), then one per chamber

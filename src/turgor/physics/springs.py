@@ -8,9 +8,13 @@ of the one before it, so that lambda depends on the lambda before. With z = u / 
 addition, and the rest need not wait:
 
     v_t = v_t(before) + z' lambda',   lambda = -(M (u v_h - u v_t(before) + bias) + M gamma J) + (M u z') lambda'
+
+What the sweeps need of it is multiplied out once a step: u / m_t is s there, and the factor of lambda' is `link`.
 """
 
 import math
+
+from numba import intp
 
 from turgor.physics.build import stage
 from turgor.physics.lanes import select
@@ -31,32 +35,40 @@ def prepare_springs(settings, model, state, work):
         inverse = select(length > SLOP, 1.0 / max(length, 1e-12), length * 0.0)
         ux = dx * inverse
         uy = dy * inverse
+        sx = ux * model.inverse_mass[t]
+        sy = uy * model.inverse_mass[t]
+        zx = ux * model.inverse_mass[h]
+        zy = uy * model.inverse_mass[h]
         # the first spring of a chain has none before it: lambda' is 0 there, whatever the link
         before = max(k - 1, 0)
         work.link[k] = model.effective_mass[k] * model.inverse_mass[t] * (ux * work.ux[before] + uy * work.uy[before])
         work.ux[k] = ux
         work.uy[k] = uy
+        work.sx[k] = sx
+        work.sy[k] = sy
+        work.zx[k] = zx
+        work.zy[k] = zy
         work.bias[k] = model.stiffness[k] * (length - state.rest[model.spring[k]])
-        state.vx[t] -= state.impulse[k] * (ux * model.inverse_mass[t])
-        state.vy[t] -= state.impulse[k] * (uy * model.inverse_mass[t])
-        state.vx[h] += state.impulse[k] * (ux * model.inverse_mass[h])
-        state.vy[h] += state.impulse[k] * (uy * model.inverse_mass[h])
+        j = state.impulse[k]
+        state.vx[t] -= j * sx
+        state.vy[t] -= j * sy
+        state.vx[h] += j * zx
+        state.vy[h] += j * zy
 
 
 @stage
 def solve_springs(settings, model, state, work):
     """One sweep over all springs."""
     for chain in range(settings.chains):
-        first = model.chain_start[chain]
-        t = model.tail[first]
+        first = intp(model.chain_start[chain])
+        t = intp(model.tail[first])
         tx = state.vx[t]  # the tail's velocity without the spring before
         ty = state.vy[t]
         zx = fill(state.vx, 0.0)
         zy = zx
         before = zx
-        for k in range(first, model.chain_start[chain + 1]):
-            t = model.tail[k]
-            h = model.head[k]
+        for k in range(first, intp(model.chain_start[chain + 1])):
+            h = intp(model.head[k])
             ux = work.ux[k]
             uy = work.uy[k]
             hx = state.vx[h]
@@ -65,13 +77,13 @@ def solve_springs(settings, model, state, work):
             pull = model.effective_mass[k] * (ux * (tx - hx) + uy * (ty - hy))
             change = (pull - (work.bias[k] + model.relaxation[k] * j)) + work.link[k] * before
             state.impulse[k] = j + change
-            state.vx[t] = (tx + zx * before) - change * (ux * model.inverse_mass[t])
-            state.vy[t] = (ty + zy * before) - change * (uy * model.inverse_mass[t])
-            zx = ux * model.inverse_mass[h]
-            zy = uy * model.inverse_mass[h]
+            state.vx[t] = (tx + zx * before) - change * work.sx[k]
+            state.vy[t] = (ty + zy * before) - change * work.sy[k]
+            zx = work.zx[k]
+            zy = work.zy[k]
             tx = hx
             ty = hy
             before = change
-        h = model.head[model.chain_start[chain + 1] - 1]
-        state.vx[h] = tx + zx * before
-        state.vy[h] = ty + zy * before
+            t = h
+        state.vx[t] = tx + zx * before
+        state.vy[t] = ty + zy * before

@@ -4,7 +4,7 @@ import numpy as np
 from numba import types
 
 from turgor.physics.actuate import actuate, agent_of, take_commands, take_lengths
-from turgor.physics.build import rare, stage
+from turgor.physics.build import THREAD, rare, stage
 from turgor.physics.contacts import column_at, find_ground_contacts, find_pair_contacts, note_travel
 from turgor.physics.control import control
 from turgor.physics.engine import COUNTS, LASTING, PASSING
@@ -13,8 +13,10 @@ from turgor.physics.manifold import NO_ID
 from turgor.physics.model import (
     COMMANDS,
     CONTROLLER,
+    ON_CPU,
+    ON_GPU,
     UNKNOWN,
-    WIDTH,
+    VIEWS,
     Brain,
     Ground,
     Model,
@@ -29,7 +31,7 @@ from turgor.physics.pressure import apply_forces, gas_law, signed_area
 from turgor.physics.sense import grow_older, sense
 from turgor.physics.solver import correct_positions, integrate, solve_velocities, warm_start_contacts
 from turgor.physics.springs import prepare_springs
-from turgor.physics.views import WidthType, lane_count, numbers, views
+from turgor.physics.views import WidthType, agents_abreast, lane_count, lane_views, numbers, views
 
 
 @stage
@@ -182,6 +184,30 @@ def hand_out(settings, model, state, work, result, observations, stands, first):
         stands[agent, 5 * n + 2 * settings.chambers] = result.solved[0, lane]
 
 
+@stage
+def run_block(
+    settings, model, ground, state, work, brain, result, script, trace, recording, fresh, position, velocity, commands,
+    observations, stands, drive, first, first_step, steps, last_step,
+):  # fmt: skip
+    """Runs the block of agents `first` ...: see `run_blocks`."""
+    row = 0
+    if len(fresh) > 0:
+        begin(settings, model, ground, state, work, result, fresh, position, velocity, first, first_step)
+        if recording:
+            record(settings, state, work, trace, row)
+            row += 1
+    for k in range(steps):
+        t = first_step + k
+        step(settings, model, ground, state, work, brain, script, commands, drive, first, t, k)
+        if recording:
+            record(settings, state, work, trace, row)
+            row += 1
+        if note_end(settings, model, state, result, t, t == last_step):
+            break
+    if len(observations) > 0:
+        hand_out(settings, model, state, work, result, observations, stands, first)
+
+
 @rare
 def run_blocks(
     width, constants, layouts, tables, grounds, memory, brains, results, position, velocity, scripts, traces, fresh,
@@ -196,32 +222,51 @@ def run_blocks(
     """
     settings = numbers(Settings, constants)
     model = views(Model, tables, layouts[0], width)
-    recording = traces.shape[1] > 0
+    script = views(Script, scripts[0], layouts[6], width)
+    trace = views(Trace, traces[0], layouts[6], width)
     for block in range(len(memory)):
         ground = views(Ground, grounds[block if settings.own_ground != 0 else 0], layouts[1], width)
         state = views(State, memory[block], layouts[2], width)
         work = views(Work, memory[block], layouts[3], width)
         brain = views(Brain, brains[block], layouts[4], width)
         result = views(Result, results[block], layouts[5], width)
-        script = views(Script, scripts[0], layouts[6], width)
-        trace = views(Trace, traces[0], layouts[6], width)
-        first = block * lane_count(width)
-        row = 0
-        if len(fresh) > 0:
-            begin(settings, model, ground, state, work, result, fresh, position, velocity, first, first_step)
-            if recording:
-                record(settings, state, work, trace, row)
-                row += 1
-        for k in range(steps):
-            t = first_step + k
-            step(settings, model, ground, state, work, brain, script, commands, drive, first, t, k)
-            if recording:
-                record(settings, state, work, trace, row)
-                row += 1
-            if note_end(settings, model, state, result, t, t == last_step):
-                break
-        if len(observations) > 0:
-            hand_out(settings, model, state, work, result, observations, stands, first)
+        run_block(
+            settings, model, ground, state, work, brain, result, script, trace, traces.shape[1] > 0, fresh, position,
+            velocity, commands, observations, stands, drive, block * lane_count(width), first_step, steps, last_step,
+        )  # fmt: skip
 
 
-ARGUMENTS = (WidthType(WIDTH), *LASTING.values(), *PASSING.values(), *(types.int64 for _ in COUNTS))
+@rare
+def run_agent(
+    width, constants, layouts, tables, grounds, memory, brains, results, position, velocity, scripts, traces, fresh,
+    commands, observations, stands, drive, first_step, steps, last_step, agent,
+):  # fmt: skip
+    """The same for one `agent` alone, with a `width` of one lane: what a thread of a GPU does, if there is such an
+    agent."""
+    if agent >= len(position):
+        return
+    block = agent // agents_abreast(width)
+    lane = agent % agents_abreast(width)
+    settings = numbers(Settings, constants)
+    model = views(Model, tables, layouts[0], width)
+    ground = views(Ground, grounds[0], layouts[1], width)
+    state = lane_views(State, memory[block], layouts[2], width, lane)
+    work = lane_views(Work, memory[block], layouts[3], width, lane)
+    brain = lane_views(Brain, brains[block], layouts[4], width, lane)
+    result = lane_views(Result, results[block], layouts[5], width, lane)
+    script = lane_views(Script, scripts[0], layouts[6], width, lane)
+    trace = lane_views(Trace, traces[0], layouts[6], width, lane)
+    run_block(
+        settings, model, ground, state, work, brain, result, script, trace, traces.shape[1] > 0, fresh, position,
+        velocity, commands, observations, stands, drive, agent, first_step, steps, last_step,
+    )  # fmt: skip
+
+
+COUNTED = (*PASSING.values(), *(types.int64 for _ in COUNTS))
+ARGUMENTS = (WidthType(*ON_CPU), *LASTING.values(), *COUNTED)
+# a GPU's threads read settings and offsets again and again: there these arrays lie among the arguments themselves
+NEAR = {
+    "constants": (np.float32, (len(Settings._fields),)),
+    "layouts": (np.int64, (len(VIEWS), 1 + max(len(view._fields) for view in VIEWS))),
+}
+THREAD_ARGUMENTS = (WidthType(*ON_GPU), *(LASTING | NEAR).values(), *COUNTED, THREAD)

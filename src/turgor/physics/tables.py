@@ -32,10 +32,12 @@ from turgor.physics.model import (
     LINEAR,
     MARGIN,
     NOWHERE,
+    ON_CPU,
     SHARED,
     SINUSOID,
     VIEWS,
     WIDTH,
+    Block,
     Brain,
     Ground,
     Model,
@@ -59,10 +61,11 @@ class Kernel(NamedTuple):
     tables: np.ndarray  # float32 [size]
     layouts: np.ndarray  # offsets of the fields of VIEWS and where each ends, [view, field]
     lengths: dict[str, int]
+    block: Block
 
     def field(self, buffer: np.ndarray, view: type, name: str) -> np.ndarray:
         """A field of a `view` in one block's `buffer`, writable: [length, lane], or [length] for tables."""
-        width = 1 if view in SHARED else WIDTH
+        width = 1 if view in SHARED else self.block.abreast
         return field_of(buffer, view, self.layouts[VIEWS.index(view)], name, self.lengths, width)
 
     def size(self, view: type) -> int:
@@ -99,8 +102,9 @@ class Kernel(NamedTuple):
         }
 
 
-def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
-    """The `Kernel` of a task, with `room` for a scene that all agents share, or for one of each agent's own."""
+def make_kernel(task: Task, room: Room, own_ground: bool = False, block: Block = ON_CPU) -> Kernel:
+    """The `Kernel` of a task for agents that lie as in a `block`, with `room` for a scene that all agents share, or for
+    one of each agent's own."""
     body, physics = task.body, task.physics
     tables: dict[str, np.ndarray] = {}
     tables |= _mass_tables(body)
@@ -128,13 +132,13 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
         "window": observation_count(body) * task.sensing.window,
     }
     lengths |= _controller_lengths(task)
-    layouts = _layouts(lengths)
+    layouts = _layouts(lengths, block)
     for k, view in enumerate(VIEWS):
         expected = "task: expected fewer masses, springs, segments, hidden units, messages or a shorter window"
-        check_memory(f"{expected} ({WIDTH} agents' {view.__name__.lower()})", BYTES * int(layouts[k].max()))
+        check_memory(f"{expected} ({block.abreast} agents' {view.__name__.lower()})", BYTES * int(layouts[k].max()))
     buffer = aligned(1, layouts[0, len(fields(Model))])[0]
     settings = Settings(
-        lanes=np.int32(WIDTH),
+        lanes=np.int32(block.lanes),
         masses=np.int32(body.mass_count),
         springs=np.int32(body.spring_count),
         chambers=np.int32(body.chamber_count),
@@ -169,7 +173,7 @@ def make_kernel(task: Task, room: Room, own_ground: bool = False) -> Kernel:
         velocity_scale=np.float32(1 / task.sensing.velocity_scale),
         half_width=np.float32(task.end.half_width if isinstance(task.end, Leave) else math.inf),
     )
-    kernel = Kernel(settings, _constants(settings), buffer, layouts, lengths)
+    kernel = Kernel(settings, _constants(settings), buffer, layouts, lengths, block)
     for name, values in tables.items():
         if (np.isfinite(values) & (np.abs(values) > LARGEST)).any():
             raise InvalidInput(f"{name}: expected numbers within {LARGEST:.0e}", f"{np.abs(values).max():.3g}")
@@ -202,9 +206,10 @@ def write_ground(tables: dict[str, np.ndarray], scene: Columns, place: int = 0) 
 _BEYOND = {"left": math.inf, "right": math.inf, "floor": -math.inf, "ceiling": math.inf}
 
 
-def _layouts(lengths: dict[str, int]) -> np.ndarray:
+def _layouts(lengths: dict[str, int], block: Block) -> np.ndarray:
     """Offsets of every view; Work stands behind State in the same buffer."""
-    rows = [layout(view, lengths, 1 if view in SHARED else WIDTH) for view in VIEWS]
+    shape = (block.abreast, block.abreast // block.lanes)
+    rows = [layout(view, lengths, *((1, 1) if view in SHARED else shape)) for view in VIEWS]
     rows[VIEWS.index(Work)] += rows[VIEWS.index(State)][-1]
     table = np.zeros((len(rows), max(len(row) for row in rows)), dtype=np.int64)
     for k, row in enumerate(rows):

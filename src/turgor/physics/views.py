@@ -30,9 +30,11 @@ class Width(int):
 
 
 class WidthType(types.Type):
-    def __init__(self, width: int) -> None:
-        self.width = width
-        super().__init__(f"Width({width})")
+    """`width` lanes; `abreast` agents stand side by side in memory, by default as many."""
+
+    def __init__(self, width: int, abreast: int | None = None) -> None:
+        self.width, self.abreast = width, abreast or width
+        super().__init__(f"Width({self.width}, {self.abreast})")
 
 
 @typeof_impl.register(Width)
@@ -60,17 +62,28 @@ def lane_count(typingctx: Any, width: Any) -> Any:
     return types.intp(width), emit
 
 
+@intrinsic
+def agents_abreast(typingctx: Any, width: Any) -> Any:
+    """How many agents stand side by side in memory, as an int."""
+
+    def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        return ir.Constant(ir.IntType(64), width.abreast)
+
+    return types.intp(width), emit
+
+
 # --- one field ----------------------------------------------------------------------------------------------------
 
 
 class View(types.Type):
-    """A pointer to numbers of one kind: rows of `width` lanes, or (width None) one number each."""
+    """A pointer to numbers of one kind: rows of `width` lanes, or (width None) one number each. From one to the next it
+    is `stride` numbers."""
 
-    def __init__(self, kind: str, width: int | None) -> None:
-        self.kind, self.width = kind, width
+    def __init__(self, kind: str, width: int | None, stride: int) -> None:
+        self.kind, self.width, self.stride = kind, width, stride
         self.element = SCALAR[kind]
         self.row = self.element if width is None else Lanes(kind, width)
-        super().__init__(f"view({kind}, {width})")
+        super().__init__(f"view({kind}, {width}, {stride})")
 
 
 @register_model(View)
@@ -105,15 +118,15 @@ class _Set(AbstractTemplate):
 
 
 def _row_pointer(builder: Any, view: View, pointer: Any, index: Any) -> Any:
-    if view.width is None:
-        return builder.gep(pointer, [index])
-    first = builder.gep(pointer, [builder.mul(index, index.type(view.width))])
-    return builder.bitcast(first, Lanes(view.kind, view.width).llvm.as_pointer())
+    if view.stride > 1:
+        index = builder.mul(index, index.type(view.stride))
+    first = builder.gep(pointer, [index])
+    return first if view.width is None else builder.bitcast(first, Lanes(view.kind, view.width).llvm.as_pointer())
 
 
 def _number_pointer(builder: Any, view: View, pointer: Any, index: Any) -> Any:
     row, lane = cgutils.unpack_tuple(builder, index)
-    return builder.gep(pointer, [builder.add(builder.mul(row, row.type(view.width)), lane)])
+    return builder.gep(pointer, [builder.add(builder.mul(row, row.type(view.stride)), lane)])
 
 
 def _alignment(view: View) -> int:
@@ -164,12 +177,13 @@ def _unchanging(builder: Any, load: Any) -> Any:
 class Views(types.Type):
     """The fields of a NamedTuple of views: where the numbers lie, and the offset of each field."""
 
-    def __init__(self, cls: type, width: int) -> None:
+    def __init__(self, cls: type, width: int, row: int, number: int) -> None:
+        """Rows of `width` lanes are `row` numbers apart, those of tables `number`."""
         self.views = {
-            name: View(FIELD[annotation][0], width if FIELD[annotation][1] else None)
+            name: View(FIELD[annotation][0], *((width, row) if FIELD[annotation][1] else (None, number)))
             for name, (annotation, _) in fields(cls).items()
         }
-        super().__init__(f"{cls.__name__}x{width}")
+        super().__init__(f"{cls.__name__}({width}, {row}, {number})")
 
 
 @register_model(Views)
@@ -197,16 +211,34 @@ def _field_of_views(context: Any, builder: Any, views: Views, value: Any, name: 
 
 @intrinsic
 def views(typingctx: Any, cls: Any, buffer: Any, offsets: Any, width: Any) -> Any:
-    """The fields of a NamedTuple `cls` of views into the float32 array `buffer` [size], at `offsets` (see `layout`)."""
-    result = Views(cls.instance_class, width.width)
+    """The fields of a NamedTuple `cls` of views into the float32 array `buffer` [size], at `offsets` (see `layout`): of
+    all lanes of a block, or of tables that all blocks share."""
+    result = Views(cls.instance_class, width.width, width.width, 1)
 
     def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-        made = cgutils.create_struct_proxy(result)(context, builder)
-        made.numbers = cgutils.create_struct_proxy(buffer)(context, builder, values[1]).data
-        made.offsets = cgutils.create_struct_proxy(offsets)(context, builder, values[2]).data
-        return made._getvalue()
+        return _made(context, builder, sig, values)._getvalue()
 
     return result(cls, buffer, offsets, width), emit
+
+
+@intrinsic
+def lane_views(typingctx: Any, cls: Any, buffer: Any, offsets: Any, width: Any, lane: Any) -> Any:
+    """The same of one `lane` alone among all that stand side by side: tables of the block's are its own."""
+    result = Views(cls.instance_class, 1, width.abreast, width.abreast)
+
+    def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        made = _made(context, builder, sig, values)
+        made.numbers = builder.gep(made.numbers, [values[4]])
+        return made._getvalue()
+
+    return result(cls, buffer, offsets, width, types.int64), emit
+
+
+def _made(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+    made = cgutils.create_struct_proxy(sig.return_type)(context, builder)
+    made.numbers = cgutils.create_struct_proxy(sig.args[1])(context, builder, values[1]).data
+    made.offsets = cgutils.create_struct_proxy(sig.args[2])(context, builder, values[2]).data
+    return made
 
 
 # --- single numbers -----------------------------------------------------------------------------------------------
