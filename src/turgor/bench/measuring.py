@@ -49,7 +49,7 @@ class Plan(msgspec.Struct, frozen=True):
     peer_batch: int = 1024  # that the engine runs beside it
     evogym: str | None = None  # a Python that has EvoGym
     evogym_robots: int = 2  # one after the other
-    evogym_steps: int = 600  # of each: a step on the ground of its walking task takes some milliseconds
+    evogym_steps: int = 100  # of each: on the ground of its walking task a step takes about a millisecond
 
 
 QUICK = Plan(
@@ -74,7 +74,7 @@ QUICK = Plan(
     peer_agents=2,
     peer_batch=256,
     evogym_robots=1,
-    evogym_steps=300,
+    evogym_steps=50,
 )
 
 
