@@ -72,6 +72,18 @@ def test_rows_beside_the_engine(rows: list[Row]) -> None:
     assert "10 masses, 21 springs; 212 masses in its world" in walker.what
 
 
+def test_without_box2d_there_are_still_rows(
+    python: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(peers, "PEER", Path("nowhere/box2d_peer.py"))
+    peers.load_peer.cache_clear()
+    plan = msgspec.structs.replace(PLAN, evogym=python, controllers=("random", "inflated"), evogym_steps=5, repeats=1)
+    rows = list(peers.peer(plan))
+    assert {row.name.partition(".evogym")[0] for row in rows} == {"peer.engine", "peer", "peer.ratio"}
+    assert len(rows) == 2 + 2 * 7
+    assert "no rows for Box2D" in capsys.readouterr().err
+
+
 def test_time_in_falls(rows: list[Row]) -> None:
     """A step of EvoGym is 3.3 times as much of a fall from mass to mass as one of turgor."""
     (fast, *_), (falls, *_) = rows_of(rows, "peer.ratio.evogym"), rows_of(rows, "peer.ratio.evogym.life")
