@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from turgor import bench
-from turgor.bench import measuring, page, parts, scaling
+from turgor.bench import measuring, page, parts, peers, scaling
 from turgor.bench.report import read_record, rows_of
 from turgor.errors import InvalidInput
 from turgor.simulate import Simulator, available_cores
@@ -55,7 +55,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 @pytest.fixture(scope="module")
 def peer() -> Any:
     try:
-        return parts.load_peer()
+        return peers.load_peer()
     except bench.Skipped as reason:
         pytest.skip(str(reason))
 
@@ -197,8 +197,8 @@ def test_environments_do_what_the_rollout_does() -> None:
 
 
 def test_peer_rows(peer: Any) -> None:
-    rows = list(parts.peer(TINY))
-    others = list(parts.peers(peer))
+    rows = list(peers.peer(TINY))
+    others = list(peers.peers(peer))
     names = [f"peer.{name}" for name in (*others, "engine", "engine")]
     names += [name for other in others for name in 2 * [bench.report.ratio_name(other)]] + ["peer.difference"]
     assert [row.name for row in rows] == 3 * names
@@ -340,6 +340,7 @@ def test_parts_that_were_not_measured_are_left_out_of_the_page() -> None:
     [
         (["--from", "nowhere.csv"], "expected a file of an earlier run"),
         (["--from", "rows.json", "--only", "kernel"], "--from: expected with --page or --compare alone"),
+        (["--from", "rows.json", "--evogym", "python"], "--from: expected with --page or --compare alone"),
         (["--from", "rows.json"], "expected what --csv or --json wrote; got no cpu"),
         (["--page", "rows.json"], "--page: expected a folder"),
     ],
@@ -377,8 +378,8 @@ def test_a_part_that_cannot_be_measured_says_so(
         raise RuntimeError("no luck")
         yield
 
-    parts.load_peer.cache_clear()
-    monkeypatch.setattr(parts, "PEER", Path("nowhere/box2d_peer.py"))
+    peers.load_peer.cache_clear()
+    monkeypatch.setattr(peers, "PEER", Path("nowhere/box2d_peer.py"))
     monkeypatch.setitem(bench.PARTS, "memory", broken)
     assert bench.main(["--quick", "--only", "memory", "peer"]) == 1
     told = capsys.readouterr().err

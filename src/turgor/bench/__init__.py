@@ -5,6 +5,7 @@
     turgor bench --compare results.csv             and what changed since then
     turgor bench --page FOLDER                     and a page with tables and figures
     turgor bench --from results.csv --page FOLDER  that page from the rows of an earlier run
+    turgor bench --evogym PYTHON                   with robots of EvoGym, run by a Python that has it
     turgor bench --quick                           a look, in about a minute
 
 Every row says what was measured. What is to be compared is measured in turn in one run, and the fastest of several
@@ -18,6 +19,9 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import msgspec
+
+from turgor.bench.evogym import find_python
 from turgor.bench.measuring import QUICK, Plan, Skipped
 from turgor.bench.parts import PARTS
 from turgor.bench.report import (
@@ -42,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help=f"measure these: {', '.join(PARTS)}")
     parser.add_argument("--skip", nargs="+", choices=PARTS, metavar="PART", default=[], help="leave these out")
     parser.add_argument("--quick", action="store_true", help="fewer rows and shorter: for a look, not for a record")
+    parser.add_argument("--evogym", metavar="PYTHON", help="a Python that has EvoGym, for the part peer")
     parser.add_argument("--csv", metavar="FILE", help="write the rows there; in a folder, to MACHINE.csv")
     parser.add_argument("--json", metavar="FILE", help="the same as JSON; in a folder, to MACHINE.json")
     parser.add_argument("--page", type=Path, metavar="FOLDER", help="write benchmarks.md there, and figures in images")
@@ -74,7 +79,10 @@ def run(namespace: argparse.Namespace) -> int:
     if namespace.source is not None:
         here, rows = earlier(namespace, here)
     else:
-        status = measure_all(names, QUICK if namespace.quick else Plan(), rows, here)
+        plan = QUICK if namespace.quick else Plan()
+        if "peer" in names or namespace.evogym is not None:
+            plan = msgspec.structs.replace(plan, evogym=find_python(namespace.evogym))
+        status = measure_all(names, plan, rows, here)
     if rows:
         show(rows, here)
         if before is not None:
@@ -85,7 +93,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def earlier(namespace: argparse.Namespace, here: dict[str, str]) -> tuple[dict[str, str], list[Row]]:
     """What the rows of --from depend on, and the rows. Raises `InvalidInput`."""
-    given = [name for name in ("only", "skip", "quick", "csv", "json") if getattr(namespace, name)]
+    given = [name for name in ("only", "skip", "quick", "evogym", "csv", "json") if getattr(namespace, name)]
     if given:
         raise InvalidInput("--from: expected with --page or --compare alone", f"--{given[0]} as well")
     record = read_record(namespace.source)

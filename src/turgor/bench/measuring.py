@@ -47,6 +47,9 @@ class Plan(msgspec.Struct, frozen=True):
     peer_bodies: tuple[str, ...] = ("large", "small")
     peer_agents: int = 6  # that the peer runs, one after the other
     peer_batch: int = 1024  # that the engine runs beside it
+    evogym: str | None = None  # a Python that has EvoGym
+    evogym_robots: int = 2  # one after the other
+    evogym_steps: int = 100  # of each: on the ground of its walking task a step takes about a millisecond
 
 
 QUICK = Plan(
@@ -70,6 +73,8 @@ QUICK = Plan(
     peer_bodies=("large",),
     peer_agents=2,
     peer_batch=256,
+    evogym_robots=1,
+    evogym_steps=50,
 )
 
 

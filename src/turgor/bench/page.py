@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from turgor.bench.figures import draw_evolution, draw_scaling
+from turgor.bench.measuring import MILLION
 from turgor.bench.report import PEERS, Record, Row, ratio_name, rows_of
 from turgor.experiments.rows import markdown_table
 from turgor.files import write_whole, writing
@@ -88,10 +89,31 @@ controller), but more than half of its time is Python's: a program in C++ on the
   as turgor does until chaos sets in.
 * **Box2D v3** (`pyb2d3`): the same body, scene, sensing and controller, in steps of the same length; its solver is
   another one, with softer contacts, so that an agent moves otherwise, and has other contacts to solve.
-* **Not here**: EvoGym. Its package, 2.0.0, is for Python 3.7 to 3.10, and turgor for 3.11 and later; a fork,
-  evogym-py313 0.1.0, installs on Python 3.11, but has its simulator as a file for CPython 3.13 alone, and not its
-  sources. Its voxels would be no more than a comparable body anyway: they hold no gas, and have other springs and
-  contacts.
+"""
+
+VOXELS = """## EvoGym
+
+Not the same agent, but the nearest one in another simulator of soft robots that are evolved. EvoGym is for Python
+3.7 to 3.10, so that it runs in a process of its own, which takes turns with the engine, on one core.
+
+* **Comparable**: the number of masses. Beside the large body (20 masses, 20 springs) stands a robot of 4 x 3 voxels,
+  with masses at their corners and springs on edges and diagonals (20 and 55), beside the small one (10 and 10) a
+  robot of 4 x 1 (10 and 21). Both have a linear controller with a tanh, of the mean of the last 25 observations,
+  with random weights. Every voxel is an actuator (12 and 4 outputs instead of 21 and 11). turgor's agents are the
+  inflated ones, which keep their shape as voxels do.
+* **Not comparable**: all else. Voxels hold no gas, and touch is not observed. EvoGym's contacts are stiff forces and
+  its springs are integrated in steps so short that they stay stable, while turgor solves for impulses as Box2D does.
+  So a step of EvoGym is 30 Runge-Kutta steps of 0.0001 s, with forces computed four times in each.
+* **Time** has another unit, so that steps are not the same thing. EvoGym's step is 0.003 s, but at a gravity of 110 and
+  with voxels of 0.1; [its authors](https://github.com/EvolutionGym/evogym/issues/49) give the numbers no units. What
+  both have is the time in which a mass falls as far as its neighbour is away, 0.043 s there and 0.79 s here. One of
+  EvoGym's steps is 3.3 times as much of it as one of turgor's: the last two columns.
+* **Worlds**: *plane* is the ground within EvoGym's physics, which costs it next to nothing. *Walker-v0* is that of its
+  walking task, 100 fixed voxels, whose masses and springs it simulates as it does the robot's. turgor's agents are on
+  hills.
+
+EvoGym's simulator is called directly, without Gymnasium, and nothing is drawn. *In its C++* is the part of the time
+that calls of its step take: what no better program around it could save.
 """
 
 
@@ -111,7 +133,7 @@ def page_text(record: Record) -> str:
     """The page as Markdown; parts that were not measured are left out."""
     rows = record.rows
     parts = [HEAD.format(machine=record.facts["machine"]), machine(record.facts)]
-    parts += [part(rows) for part in (kernel, scaling, environments, evolutions, start, peers)]
+    parts += [part(rows) for part in (kernel, scaling, environments, evolutions, start, peers, voxels)]
     return "\n".join(part for part in parts if part)
 
 
@@ -251,3 +273,21 @@ def peers(rows: Sequence[Row]) -> str:
         lines.append([row.body, row.controllers, *cells, figures(few.value), figures(many.value)])
         lines[-1] += [f"{ratio} times" for ratio in ratios]
     return f"{BESIDE}\nMillion agent-steps/s on one core:\n\n{markdown_table(heads, lines)}"
+
+
+def voxels(rows: Sequence[Row]) -> str:
+    """EvoGym's robots beside the engine."""
+    lines = []
+    for row in rows_of(rows, "peer.evogym"):
+        same = {"body": row.body, "task": row.task}
+        few, many = sorted({each.batch or 0 for each in rows_of(rows, "peer.ratio.evogym", **same)})
+        told = [one(rows, "peer.evogym.life", **same), f"{one(rows, 'peer.evogym.simulator', **same)} %"]
+        ratios = [
+            one(rows, name, **same, batch=batch)
+            for name in ("peer.ratio.evogym", "peer.ratio.evogym.life")
+            for batch in (few, many)
+        ]
+        lines.append([row.body, row.task, figures(row.value * MILLION), *told, *(f"{ratio} times" for ratio in ratios)])
+    heads = ["beside", "world", "agent-steps/s", "its own s/s", "in its C++"]
+    heads += ["turgor, one at a time", "all at once", "the same in falls, one at a time", "all at once"]
+    return f"{VOXELS}\n{markdown_table(heads, lines)}" if lines else ""

@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,9 @@ from turgor.bench.measuring import (
     usable_threads,
     warm_up,
 )
-from turgor.bench.report import PEERS, Row, ratio_name, say
+from turgor.bench.peers import peer
+from turgor.bench.report import Row, say
 from turgor.bench.scaling import scaling
-
-PEER = Path(__file__).parents[3] / "benchmarks" / "box2d_peer.py"  # not part of the installed package
 
 
 def kernel(plan: Plan) -> Iterator[Row]:
@@ -231,77 +230,6 @@ def evolution_rows(body: str, evaluations: int, wall: float, told: dict[str, Any
     for name, value, unit, what in figures:
         yield Row(name=name, body=body, task="hilly", controllers="evolved", batch=told["population"],
                   threads=told["threads"], value=value, unit=unit, what=what)  # fmt: skip
-
-
-def peer(plan: Plan) -> Iterator[Row]:
-    """Rows: the same agent in programs on other engines and in this one, in turn, all on one core."""
-    box2d_peer = load_peer()
-    for body in plan.peer_bodies:
-        for kind in plan.controllers:
-            yield from peer_rows(plan, box2d_peer, body, kind)
-
-
-def peer_rows(plan: Plan, box2d_peer: Any, body: str, kind: str) -> Iterator[Row]:
-    """Rows of one body: the rates, the engine's against the peers', and how far apart the agents are."""
-    from threadpoolctl import threadpool_limits
-
-    from turgor.simulate import Simulator
-
-    task = make_task("hilly", body, plan.steps, kind)
-    simulator = Simulator(task, threads=1)
-    many = controllers(kind, task, plan.peer_batch, plan.generations)
-    few = many[: plan.peer_agents]
-
-    def each(run: Callable[..., object], *given: Any) -> None:
-        for theta in few:
-            run(theta, *given)
-
-    others = peers(box2d_peer)
-    calls: list[Callable[[], object]] = []
-    calls += [partial(each, partial(box2d_peer.rollout, task), agent) for agent in others.values()]
-    calls += [lambda: each(lambda theta: simulator.rollout(theta[None])), lambda: simulator.rollout(many)]
-    with threadpool_limits(1):
-        times = fastest(calls, plan.seconds, plan.repeats)
-    rates = [len(few) * plan.steps / took / MILLION for took in times[:-1]]
-    rates.append(len(many) * plan.steps / times[-1] / MILLION)
-    same: dict[str, Any] = {"body": body, "task": "hilly", "controllers": kind, "threads": 1}
-    told = [*(f"{PEERS[name]}, {len(few)} agents one after the other" for name in others)]
-    told += [f"the engine, {len(few)} agents one after the other", "the engine, all agents at once"]
-    names, batches = [*others, "engine", "engine"], [1] * (len(others) + 1) + [len(many)]
-    for name, batch, rate, what in zip(names, batches, rates, told, strict=True):
-        yield Row(name=f"peer.{name}", **same, batch=batch, value=rate, unit="M agent-steps/s", what=what)
-    for k, name in enumerate(others):
-        for batch, rate in zip((1, len(many)), rates[-2:], strict=True):
-            what = f"the engine against {PEERS[name]}, measured in turn"
-            yield Row(name=ratio_name(name), **same, batch=batch, value=rate / rates[k], unit="times", what=what)
-    together = min(30, plan.steps)
-    there, here = box2d_peer.trajectory(task, few[0], together), simulator.record(few[0]).position[: together + 1]
-    what = f"largest difference of a coordinate between pybox2d and the engine in the first {together} steps"
-    yield Row(name="peer.difference", **same, batch=1, value=float(abs(there - here).max()), unit="m", what=what)
-
-
-def peers(box2d_peer: Any) -> dict[str, Any]:
-    """The agents of the peers that can run here, by name."""
-    from turgor.fidelity.engines import installed
-
-    if "box2d-v3" in installed():
-        return {"box2d": box2d_peer.Agent, "box2d-v3": box2d_peer.AgentV3}
-    say("Box2D v3 (the package pyb2d3) cannot be imported: no rows for it")
-    return {"box2d": box2d_peer.Agent}
-
-
-@cache
-def load_peer() -> Any:
-    """The module benchmarks/box2d_peer.py; raises `Skipped` where it or Box2D is missing."""
-    spec = importlib.util.spec_from_file_location("box2d_peer", PEER)
-    if spec is None or spec.loader is None or not PEER.exists():
-        raise Skipped("benchmarks/box2d_peer.py is in the repository, not in the installed package")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except ImportError as error:
-        raise Skipped(f"the package box2d cannot be imported ({error})") from None
-    return module
 
 
 PARTS: dict[str, Callable[[Plan], Iterator[Row]]] = {

@@ -22,7 +22,7 @@ def _bench(options: argparse.Namespace) -> int:
 BENCH = Command(
     "Measure how fast the engine is on this machine.",
     "examples:\n  turgor bench --quick\n  turgor bench --csv results.csv\n  turgor bench --compare results.csv\n"
-    "  turgor bench --page docs",
+    "  turgor bench --page docs\n  turgor bench --only peer --evogym ../evogym/bin/python",
     _bench_options,
     _bench,
 )
