@@ -212,10 +212,6 @@ class Work(NamedTuple):
     # springs, in the order of solving
     ux: Annotated[Floats, "spring"]  # unit vector from tail to head
     uy: Annotated[Floats, "spring"]
-    sx: Annotated[Floats, "spring"]  # the same, by the tail's mass [1/kg]
-    sy: Annotated[Floats, "spring"]
-    zx: Annotated[Floats, "spring"]  # by the head's
-    zy: Annotated[Floats, "spring"]
     link: Annotated[Floats, "spring"]  # how much of the impulse before it in the chain a spring takes on [1]
     bias: Annotated[Floats, "spring"]  # effective mass * bias velocity [N s]
     # commands: one per spring in (-1, 1), then one per chamber

@@ -8,8 +8,6 @@ of the one before it, so that lambda depends on the lambda before. With z = u / 
 addition, and the rest need not wait:
 
     v_t = v_t(before) + z' lambda',   lambda = -(M (u v_h - u v_t(before) + bias) + M gamma J) + (M u z') lambda'
-
-What the sweeps need of it is multiplied out once a step: u / m_t is s there, and the factor of lambda' is `link`.
 """
 
 import math
@@ -35,25 +33,16 @@ def prepare_springs(settings, model, state, work):
         inverse = select(length > SLOP, 1.0 / max(length, 1e-12), length * 0.0)
         ux = dx * inverse
         uy = dy * inverse
-        sx = ux * model.inverse_mass[t]
-        sy = uy * model.inverse_mass[t]
-        zx = ux * model.inverse_mass[h]
-        zy = uy * model.inverse_mass[h]
         # the first spring of a chain has none before it: lambda' is 0 there, whatever the link
         before = max(k - 1, 0)
         work.link[k] = model.effective_mass[k] * model.inverse_mass[t] * (ux * work.ux[before] + uy * work.uy[before])
         work.ux[k] = ux
         work.uy[k] = uy
-        work.sx[k] = sx
-        work.sy[k] = sy
-        work.zx[k] = zx
-        work.zy[k] = zy
         work.bias[k] = model.stiffness[k] * (length - state.rest[model.spring[k]])
-        j = state.impulse[k]
-        state.vx[t] -= j * sx
-        state.vy[t] -= j * sy
-        state.vx[h] += j * zx
-        state.vy[h] += j * zy
+        state.vx[t] -= state.impulse[k] * (ux * model.inverse_mass[t])
+        state.vy[t] -= state.impulse[k] * (uy * model.inverse_mass[t])
+        state.vx[h] += state.impulse[k] * (ux * model.inverse_mass[h])
+        state.vy[h] += state.impulse[k] * (uy * model.inverse_mass[h])
 
 
 @stage
@@ -77,10 +66,10 @@ def solve_springs(settings, model, state, work):
             pull = model.effective_mass[k] * (ux * (tx - hx) + uy * (ty - hy))
             change = (pull - (work.bias[k] + model.relaxation[k] * j)) + work.link[k] * before
             state.impulse[k] = j + change
-            state.vx[t] = (tx + zx * before) - change * work.sx[k]
-            state.vy[t] = (ty + zy * before) - change * work.sy[k]
-            zx = work.zx[k]
-            zy = work.zy[k]
+            state.vx[t] = (tx + zx * before) - change * (ux * model.inverse_mass[t])
+            state.vy[t] = (ty + zy * before) - change * (uy * model.inverse_mass[t])
+            zx = ux * model.inverse_mass[h]
+            zy = uy * model.inverse_mass[h]
             tx = hx
             ty = hy
             before = change
