@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from llvmlite.binding import get_host_cpu_features
 
-from turgor.simulate import Rollout, Simulator
+from turgor.simulate import Rollout, Simulator, _parts
 from turgor.task import Leave, make_task
 
 FIELDS = ("position", "com", "start", "steps", "solved", "fitness")
@@ -141,6 +141,22 @@ def test_a_recording_has_the_bits_of_the_rollout(name: str) -> None:
         same(name, np.array([agent]), rollout(name, np.array([agent])))
         assert rec.position[-1].tobytes() == alone(name).position[agent].tobytes()
         assert rec.fitness == alone(name).fitness[agent]
+
+
+def test_few_agents_are_spread_over_the_threads() -> None:
+    """Not evenly filled lanes but busy threads: a block of few agents takes less time than a full one."""
+    sizes = {
+        (n, threads): [part.stop - part.start for part in _parts(n, threads)]
+        for n in (3, 16, 25)
+        for threads in (1, 2, 16)
+    }
+    assert sizes[3, 16] == [3]
+    assert sizes[16, 1] == [16]
+    assert sizes[16, 2] == [8, 8]
+    assert sizes[16, 16] == [4, 4, 4, 4]
+    assert sorted(sizes[25, 2]) == [12, 13]
+    assert len(sizes[25, 16]) == 7
+    assert {part.stop - part.start for part in _parts(1024, 2)} == {128}  # blocks enough
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

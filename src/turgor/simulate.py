@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 DEVICES = ("cpu", "cuda")
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
+LEAST_AGENTS = 4  # of a thread's part, where there are too few agents to fill the lanes of every thread
 MOST_THREADS = 1024
 LARGEST_PUSH = 1e9  # [m/s]
 
@@ -413,9 +414,10 @@ def available_cores() -> int:
 
 
 def _parts(agents: int, threads: int, most: int = BLOCKS_AT_ONCE) -> list[slice]:
-    """The batch cut evenly: for every thread a part, as long as that fills lanes, none of more than `most` blocks."""
+    """The batch cut evenly: for every thread a part, even where that leaves lanes empty (the fewer agents a block has,
+    the fewer contacts), none of more than `most` blocks."""
     blocks = -(-agents // WIDTH)
-    return cut_evenly(agents, max(min(threads, blocks), -(-blocks // most)))
+    return cut_evenly(agents, max(min(threads, -(-agents // LEAST_AGENTS)), -(-blocks // most)))
 
 
 @lru_cache

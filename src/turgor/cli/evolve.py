@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -168,27 +167,12 @@ def _watched(out: Path, work: Callable[[ProgressDisplay], Run]) -> Run:
 
 
 def _finish(run: Run, options: argparse.Namespace) -> None:
-    """Draws what is missing, because the run was ended before, or is an earlier champion's; and sums the run up."""
+    """Sums the run up, and draws what is missing, because the run was ended before, or is an earlier champion's."""
     from turgor.records import CHAMPION
     from turgor.view.figures import fitness_figure
 
     assert run.path is not None
-    started = time.perf_counter()
     robust, unit, champion = run.settings.robust, unit_of(run.task), run.checked_champion()
-    name = name_of(run.task, run.settings.recipe, robust)
-    for path in (run.path / FIGURE, run.path / FILM):
-        if path.exists() and path.stat().st_mtime < (run.path / CHAMPION).stat().st_mtime:
-            path.unlink()
-    if not (run.path / FIGURE).exists():
-        fitness_figure(run.history, run.path / FIGURE, unit=unit.strip(), title=name)
-    if not (options.no_video or (run.path / FILM).exists()):
-        say(f"drawing {FILM} ...")
-        try:
-            draw_video(run, run.path / FILM, (1280, 720))
-        except KeyboardInterrupt:
-            raise Interrupted(f"kept in {run.path}, whole; turgor video {run.path} draws it") from None
-    drawing = time.perf_counter() - started
-
     if run.note:
         say(f"note     {run.note}")
     judged = f" {robust.told}," if robust else ""
@@ -201,8 +185,20 @@ def _finish(run: Run, options: argparse.Namespace) -> None:
     s = run.seconds
     say(
         f"time     {s['total']:.1f} s: simulation {s['simulation']:.1f}, {run.settings.strategy} {s['strategy']:.1f}, "
-        f"start {s['start']:.1f}, rest {s['rest']:.1f}; drawing {drawing:.1f} s"
+        f"start {s['start']:.1f}, rest {s['rest']:.1f}"
     )
+    for path in (run.path / FIGURE, run.path / FILM):
+        if path.exists() and path.stat().st_mtime < (run.path / CHAMPION).stat().st_mtime:
+            path.unlink()
+    if not (run.path / FIGURE).exists():
+        title = name_of(run.task, run.settings.recipe, robust)
+        fitness_figure(run.history, run.path / FIGURE, unit=unit.strip(), title=title)
+    if not (options.no_video or (run.path / FILM).exists()):
+        say(f"drawing  {FILM} ...")
+        try:
+            draw_video(run, run.path / FILM, (1280, 720))
+        except KeyboardInterrupt:
+            raise Interrupted(f"kept in {run.path}, whole; turgor video {run.path} draws it") from None
     say(f"folder   {run.path}: {' '.join(sorted(file.name for file in run.path.iterdir()))}")
     say(f"next     turgor evaluate {run.path}")
     say(f"         turgor resume {run.path} --evaluations {2 * run.settings.evaluations}")
