@@ -159,6 +159,7 @@ def test_few_agents_are_spread_over_the_threads() -> None:
     assert {part.stop - part.start for part in _parts(1024, 2)} == {128}  # blocks enough
 
 
+@pytest.mark.usefixtures("all_threads")
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_stepping_does_not_depend_on_batch_or_threads(threads: int) -> None:
     task, rng = make_task("hilly"), np.random.default_rng(2)

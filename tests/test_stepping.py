@@ -14,6 +14,7 @@ from turgor.scene import Scene, hills, polyline
 from turgor.simulate import Simulator, Step
 from turgor.task import Task, make_task
 
+pytestmark = pytest.mark.usefixtures("all_threads")
 FIELDS = ("observation", "position", "velocity", "touch", "pressure", "area", "solved")
 
 
@@ -220,3 +221,12 @@ def test_what_cannot_be_is_refused_in_one_line(case: str) -> None:
         make(simulator)
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_few_agents_are_one_threads_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Waking another thread takes longer than their step."""
+    monkeypatch.undo()
+    for body, agents, parts in (("small", 1999, 1), ("small", 2000, 2), ("large", 1000, 2), ("large", 4000, 3)):
+        simulator = Simulator(make_task(body=body), threads=3)
+        simulator.reset(agents)
+        assert len(simulator._stepping) == parts

@@ -134,6 +134,7 @@ def test_resets_by_a_mask() -> None:
         mine.step(action)
 
 
+@pytest.mark.usefixtures("all_threads")
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_threads_do_not_matter(threads: int) -> None:
     one, many = (make("turgor/Hilly-v0", 50, threads=n, steps=20) for n in (1, threads))

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 DEVICES = ("cpu", "cuda")
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
 LEAST_AGENTS = 4  # of a thread's part, where there are too few agents to fill the lanes of every thread
+LEAST_WORK = 10_000  # [mass x step] of a thread's part, 70 us and more: to wake it takes 50
 MOST_THREADS = 1024
 LARGEST_PUSH = 1e9  # [m/s]
 
@@ -130,7 +131,7 @@ class Simulator:
         load_kernel()
         own = None if scenes is None else [self._world.cut(scene) for scene in scenes]
         # a part for each thread, and no more: this memory stays
-        parts = cut_evenly(agents, min(self.threads, -(-agents // WIDTH)))
+        parts = cut_evenly(agents, self._threads_for(agents, 1))
         self._stepping = [(Batch(self._world, starts[mine], own and own[mine]), mine) for mine in parts]
         out = self._room_for_step("reset", None)
         for batch, mine in self._stepping:
@@ -224,6 +225,10 @@ class Simulator:
         """Agents that are to begin at `starts` [agent, mass, 2]."""
         return Batch(self._world, starts) if self._gpu is None else self._gpu.batch(self._world, starts)
 
+    def _threads_for(self, agents: int, steps: int) -> int:
+        """How many threads are worth waking."""
+        return min(self.threads, max(agents * self.task.body.mass_count * steps // LEAST_WORK, 1))
+
     def _run_whole(self, batch: Batch, trace: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Final positions, steps and solved of a batch that runs the whole task."""
         task = self.task
@@ -312,7 +317,7 @@ class _Work:
             self.parts = cut_evenly(agents, -(-agents // simulator._gpu.agents_at_once(world)))
             return
         most = max(1, min(BLOCKS_AT_ONCE, MOST_BYTES // world.kernel.block_bytes))
-        self.parts = _parts(agents, simulator.threads, most)
+        self.parts = _parts(agents, simulator._threads_for(agents, task.steps), most)
 
     def run(self, part: slice) -> None:
         batch = self._simulator._batch(self._starts[part])
