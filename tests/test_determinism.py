@@ -143,20 +143,20 @@ def test_a_recording_has_the_bits_of_the_rollout(name: str) -> None:
         assert rec.fitness == alone(name).fitness[agent]
 
 
-def test_few_agents_are_spread_over_the_threads() -> None:
-    """Not evenly filled lanes but busy threads: a block of few agents takes less time than a full one."""
-    sizes = {
-        (n, threads): [part.stop - part.start for part in _parts(n, threads)]
-        for n in (3, 16, 25)
-        for threads in (1, 2, 16)
-    }
-    assert sizes[3, 16] == [3]
-    assert sizes[16, 1] == [16]
-    assert sizes[16, 2] == [8, 8]
-    assert sizes[16, 16] == [4, 4, 4, 4]
-    assert sorted(sizes[25, 2]) == [12, 13]
-    assert len(sizes[25, 16]) == 7
-    assert {part.stop - part.start for part in _parts(1024, 2)} == {128}  # blocks enough
+def test_parts_are_worth_a_thread() -> None:
+    def sizes(agents: int, threads: int, masses: int = 10, steps: int = 1800) -> list[int]:
+        return [part.stop - part.start for part in _parts(agents, agents * masses * steps, threads)]
+
+    assert sizes(1024, 2) == [128] * 8  # blocks enough, no more than 8 at once
+    assert sizes(32, 1) == [32]
+    assert sizes(32, 2) == [16, 16]
+    assert sorted(sizes(25, 2)) == [12, 13]
+    assert sizes(32, 2, steps=30) == [32]  # done before another thread is awake
+    # a block is shared only where much is to be done
+    assert sizes(16, 16) == [8, 8]
+    assert sizes(16, 16, steps=600) == [16]
+    assert len(sizes(16, 16, masses=20)) == 5
+    assert sizes(3, 16, masses=20, steps=10**6) == [1, 1, 1]
 
 
 @pytest.mark.usefixtures("all_threads")

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 DEVICES = ("cpu", "cuda")
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
-LEAST_AGENTS = 4  # of a thread's part, where there are too few agents to fill the lanes of every thread
 LEAST_WORK = 10_000  # [mass x step] of a thread's part, 70 us and more: to wake it takes 50
+LEAST_SHARE = 100_000  # [mass x step] of it where lanes stay empty for it: blocks of few agents are only somewhat faster
 MOST_THREADS = 1024
 LARGEST_PUSH = 1e9  # [m/s]
 
@@ -131,7 +131,7 @@ class Simulator:
         load_kernel()
         own = None if scenes is None else [self._world.cut(scene) for scene in scenes]
         # a part for each thread, and no more: this memory stays
-        parts = cut_evenly(agents, self._threads_for(agents, 1))
+        parts = cut_evenly(agents, min(self.threads, max(agents * self.task.body.mass_count // LEAST_WORK, 1)))
         self._stepping = [(Batch(self._world, starts[mine], own and own[mine]), mine) for mine in parts]
         out = self._room_for_step("reset", None)
         for batch, mine in self._stepping:
@@ -225,10 +225,6 @@ class Simulator:
         """Agents that are to begin at `starts` [agent, mass, 2]."""
         return Batch(self._world, starts) if self._gpu is None else self._gpu.batch(self._world, starts)
 
-    def _threads_for(self, agents: int, steps: int) -> int:
-        """How many threads are worth waking."""
-        return min(self.threads, max(agents * self.task.body.mass_count * steps // LEAST_WORK, 1))
-
     def _run_whole(self, batch: Batch, trace: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Final positions, steps and solved of a batch that runs the whole task."""
         task = self.task
@@ -317,7 +313,7 @@ class _Work:
             self.parts = cut_evenly(agents, -(-agents // simulator._gpu.agents_at_once(world)))
             return
         most = max(1, min(BLOCKS_AT_ONCE, MOST_BYTES // world.kernel.block_bytes))
-        self.parts = _parts(agents, simulator._threads_for(agents, task.steps), most)
+        self.parts = _parts(agents, agents * task.body.mass_count * task.steps, simulator.threads, most)
 
     def run(self, part: slice) -> None:
         batch = self._simulator._batch(self._starts[part])
@@ -418,11 +414,13 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _parts(agents: int, threads: int, most: int = BLOCKS_AT_ONCE) -> list[slice]:
-    """The batch cut evenly: for every thread a part, even where that leaves lanes empty (the fewer agents a block has,
-    the fewer contacts), none of more than `most` blocks."""
+def _parts(agents: int, work: int, threads: int, most: int = BLOCKS_AT_ONCE) -> list[slice]:
+    """The batch, which is `work` [mass x step], cut evenly: a part for each thread that is worth waking, none of more
+    than `most` blocks."""
     blocks = -(-agents // WIDTH)
-    return cut_evenly(agents, max(min(threads, -(-agents // LEAST_AGENTS)), -(-blocks // most)))
+    filled = min(threads, blocks, max(work // LEAST_WORK, 1))
+    shared = min(threads, agents, work // LEAST_SHARE)
+    return cut_evenly(agents, max(filled, shared, -(-blocks // most)))
 
 
 @lru_cache
