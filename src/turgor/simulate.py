@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 DEVICES = ("cpu", "cuda")
 BLOCKS_AT_ONCE = 8  # of a thread: memory does not grow with the batch
 LEAST_WORK = 10_000  # [mass x step] of a thread's part, 70 us and more: to wake it takes 50
-LEAST_SHARE = 100_000  # [mass x step] of it where lanes stay empty for it: blocks of few agents are only somewhat faster
+LEAST_SHARE = 100_000  # [mass x step] of it where lanes stay empty: blocks of few agents are only somewhat faster
 MOST_THREADS = 1024
 LARGEST_PUSH = 1e9  # [m/s]
 
