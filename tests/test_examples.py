@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import turgor
+from turgor.errors import InvalidInput
+from turgor.simulate import open_gpu
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -60,6 +62,11 @@ def test_example_with_ribs_maps_gaits_and_saves_them_by_name(tmp_path: Path) -> 
 def test_page_shows_what_works(page: str, tmp_path: Path) -> None:
     code = PROGRAMS[page]
     skip_without_its_packages(code)
+    if 'device="cuda"' in code:
+        try:
+            open_gpu()
+        except InvalidInput as reason:
+            pytest.skip(f"needs a GPU: {reason}")
     subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=tmp_path, check=True, timeout=300)
 
 
